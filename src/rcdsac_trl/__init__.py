@@ -1,0 +1,1 @@
+"""Risk-conditioned distributional soft actor-critic for risk-sensitive navigation, on TorchRL."""

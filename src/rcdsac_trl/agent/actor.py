@@ -1,0 +1,156 @@
+"""Networks wired to tensor keys: the actor and the critics that learn, and the policy that acts.
+
+Public names::
+
+    build_actor(action_size, vectors, measure | None, widths) -> TensorDictSequential   [encoder, head]
+        observations [B,T,..], risk -> memory [B,T,128], loc, scale [B,T,A]
+    build_critic(action_size, vectors, kind="quantile"|"scalar", measure | None, widths) -> TensorDictSequential
+        observations, action, (tau, risk) -> memory, quantiles [B,T,N]  |  state_action_value [B,T,1]
+    build_policy(actor, action_spec, generator=None) -> ProbabilisticActor              one step, any batch
+        observations, risk, is_init, recurrent_state -> loc, scale, action, ("next", "recurrent_state")
+    recurrent_state_primer(memory_size) -> TensorDictPrimer
+    OBSERVATIONS = {"waypoint": 6, "velocity": 4}   vector observations besides "range"
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import TensorSpec, Unbounded
+from torchrl.envs.transforms import TensorDictPrimer
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from rcdsac_trl.agent.networks import ActorHead, Encoder, QuantileHead, ScalarHead, Widths
+from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.errors import UserInputError
+
+#: Name and size of the vector observations every agent reads besides ``range``.
+OBSERVATIONS: dict[str, int] = {"waypoint": 6, "velocity": 4}
+#: What the encoder hands to the heads.
+MEMORY_KEY = "memory"
+#: Where the acting policy keeps its memory between steps.
+STATE_KEY = "recurrent_state"
+
+
+def _encoder(vectors: Mapping[str, int], widths: Widths) -> TensorDictModule:
+    return TensorDictModule(Encoder(vectors, widths), in_keys=["range", *vectors], out_keys=[MEMORY_KEY])
+
+
+def build_actor(
+    action_size: int = 2,
+    vectors: Mapping[str, int] = OBSERVATIONS,
+    measure: RiskMeasure | None = None,
+    widths: Widths | None = None,
+) -> TensorDictSequential:
+    """Return the actor on sequences: an encoder and a head.
+
+    Args:
+        action_size: number of action dimensions.
+        vectors: name and size of the vector observations; add ``collision_weight: 1`` for RCWR.
+        measure: conditions the actor on ``risk``; None for no conditioning.
+        widths: layer widths; None for the paper's.
+
+    Returns:
+        Two modules: observations ``[B, T, ..]`` to ``memory`` ``[B, T, 128]``, and ``memory`` (and ``risk``
+        ``[B, T, 1]``) to ``loc`` and ``scale`` ``[B, T, action_size]``.
+
+    Example:
+        >>> actor = build_actor(measure=CVaR())
+        >>> actor.in_keys
+        ['range', 'waypoint', 'velocity', 'risk']
+    """
+    widths = widths or Widths()
+    head = TensorDictModule(
+        ActorHead(action_size, widths, measure),
+        in_keys=[MEMORY_KEY] if measure is None else [MEMORY_KEY, "risk"],
+        out_keys=["loc", "scale"],
+    )
+    return TensorDictSequential(_encoder(vectors, widths), head)
+
+
+def build_critic(
+    action_size: int = 2,
+    vectors: Mapping[str, int] = OBSERVATIONS,
+    kind: Literal["quantile", "scalar"] = "quantile",
+    measure: RiskMeasure | None = None,
+    widths: Widths | None = None,
+) -> TensorDictSequential:
+    """Return one critic on sequences: its own encoder and a quantile or a scalar head.
+
+    Args:
+        action_size: number of action dimensions.
+        vectors: name and size of the vector observations.
+        kind: ``"quantile"`` for the distribution of the return at the fractions ``tau``, ``"scalar"`` for its mean.
+        measure: conditions a quantile critic on ``risk``; None for no conditioning.
+        widths: layer widths; None for the paper's.
+
+    Raises:
+        UserInputError: for an unknown kind, or a scalar critic with a measure.
+    """
+    widths = widths or Widths()
+    head: nn.Module
+    if kind == "quantile":
+        head = QuantileHead(action_size, widths, measure)
+        in_keys = [MEMORY_KEY, "action", "tau"] + ([] if measure is None else ["risk"])
+        out_keys = ["quantiles"]
+    elif kind == "scalar":
+        if measure is not None:
+            raise UserInputError(
+                f"a scalar critic cannot be conditioned on risk (measure {measure.name!r}): choose critic 'quantile'"
+            )
+        head = ScalarHead(action_size, widths)
+        in_keys, out_keys = [MEMORY_KEY, "action"], ["state_action_value"]
+    else:
+        raise UserInputError(f"there is no critic {kind!r}: choose 'quantile' or 'scalar'")
+    return TensorDictSequential(_encoder(vectors, widths), TensorDictModule(head, in_keys=in_keys, out_keys=out_keys))
+
+
+class _Step(nn.Module):
+    """One-step view of an encoder; shares its parameters."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        state = self.encoder.step(*inputs)
+        return state, state
+
+
+def build_policy(
+    actor: TensorDictSequential, action_spec: TensorSpec, generator: torch.Generator | None = None
+) -> ProbabilisticActor:
+    """Return the acting policy of an actor; it shares the actor's parameters.
+
+    It reads the observations, ``risk`` where the actor does, ``is_init`` and ``recurrent_state`` at any leading
+    dimensions and writes ``loc``, ``scale``, ``action`` and ``("next", "recurrent_state")``. Under
+    ``ExplorationType.DETERMINISTIC`` the action is ``tanh(loc)``.
+
+    Args:
+        actor: from :func:`build_actor`.
+        action_spec: the environment's action spec, within [-1, 1].
+        generator: source of the action noise; None for torch's global one.
+    """
+    encoder, head = actor[0], actor[1]
+    step = TensorDictModule(
+        _Step(encoder.module),
+        in_keys=[*encoder.in_keys, "is_init", STATE_KEY],
+        out_keys=[MEMORY_KEY, ("next", STATE_KEY)],
+    )
+    network = TensorDictSequential(step, head, selected_out_keys=["loc", "scale", ("next", STATE_KEY)])
+    return ProbabilisticActor(
+        network,
+        in_keys=["loc", "scale"],
+        spec=action_spec,
+        distribution_class=TanhNormal,
+        default_interaction_type=ExplorationType.RANDOM,
+        generator=generator,
+    )
+
+
+def recurrent_state_primer(memory_size: int = Widths.memory) -> TensorDictPrimer:
+    """Return the transform that puts a zero ``recurrent_state`` ``[*, memory_size]`` into every reset."""
+    return TensorDictPrimer({STATE_KEY: Unbounded((memory_size,))}, default_value=0.0, expand_specs=True)

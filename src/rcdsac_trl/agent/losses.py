@@ -1,0 +1,464 @@
+r"""Distributional soft actor-critic on sequences: critic, actor and temperature loss.
+
+Public names::
+
+    DistributionalSACLoss(actor, critics, *, measure=None, num_quantiles=16, num_target_quantiles=16,
+                          num_risk_samples=16, fractions_per="sequence", kappa=1.0, loss_function="smooth_l1",
+                          alpha_init=1.0, target_entropy=-2.0, burn_in=0, reduction="mean", generator=None)
+        forward(batch [B, L+1]) -> loss_actor, loss_qvalue, loss_alpha, alpha, entropy, td_error, q_value
+                                   (, quantile_spread)
+        .make_value_estimator(gamma=0.99)   .set_keys(...)   .rng_state (get and set; also in state_dict)
+        .compute_target(batch, memories)  .qvalue_loss(batch, memories)  .actor_loss(batch, memories)
+        SoftUpdate(loss, eps=...) works; parameters: loss.actor_network_params, loss.critic_network_params,
+        loss.log_alpha
+    quantile_huber_loss(quantiles [..,N], targets [..,N'], tau [..,N], kappa=1) -> [..]
+    squash(loc, scale, noise) -> action, log_prob
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, TensorDictSequential, dispatch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchrl.objectives.common import LossModule
+from torchrl.objectives.utils import (
+    ValueEstimators,
+    _cache_values,
+    _reduce,
+    dispatch_value_estimator,
+    distance_loss,
+)
+
+from rcdsac_trl.agent.risk import RiskMeasure
+
+
+def quantile_huber_loss(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
+    r"""Quantile regression by pairwise Huber errors, as the paper normalises it.
+
+    .. math:: \frac{1}{N'} \sum_{i=1}^{N} \sum_{j=1}^{N'}
+              |\tau_i - \mathbb{I}\{\delta_{ij} < 0\}| \, L_\kappa(\delta_{ij}) / \kappa,
+              \qquad \delta_{ij} = \text{targets}_j - \text{quantiles}_i
+
+    with :math:`L_\kappa(x) = x^2/2` up to :math:`\kappa` and :math:`\kappa(|x| - \kappa/2)` beyond (paper, critic loss;
+    its printed :math:`\min\{x^2, 2|x|-1\}/2` is never quadratic, a misprint).
+
+    Args:
+        quantiles: predictions ``[.., N]``; gradients flow.
+        targets: target samples ``[.., N']``; treated as constants by the caller.
+        tau: fractions ``[.., N]`` of the predictions, broadcastable to them.
+        kappa: where the loss turns from quadratic to linear, above 0.
+
+    Returns:
+        The loss ``[..]``: a sum over the predictions, a mean over the targets.
+
+    Example:
+        >>> quantile_huber_loss(torch.zeros(1), torch.tensor([2.0]), torch.tensor([0.25]))
+        tensor(0.3750)
+    """
+    shape = torch.broadcast_shapes(quantiles.unsqueeze(-1).shape, targets.unsqueeze(-2).shape)
+    prediction, target = quantiles.unsqueeze(-1).expand(shape), targets.unsqueeze(-2).expand(shape)
+    huber = F.huber_loss(prediction, target, reduction="none", delta=kappa)
+    with torch.no_grad():
+        weight = (tau.unsqueeze(-1) - (target < prediction).to(tau.dtype)).abs_()
+    # One product and sum instead of a mean and a sum: the [.., N, N'] tensors dominate the cost.
+    return (huber * weight).sum((-2, -1)) / (kappa * targets.shape[-1])
+
+
+def squash(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return ``tanh(loc + scale * noise)`` and its log density, both differentiable.
+
+    The distribution is TorchRL's ``TanhNormal(loc, scale)``; written out here because the noise comes from an
+    explicit generator and because it is a small part of that class's cost.
+
+    Args:
+        loc: mean before tanh ``[.., A]``.
+        scale: standard deviation before tanh ``[.., A]``.
+        noise: standard normal numbers ``[.., A]``.
+
+    Returns:
+        The action ``[.., A]`` and the log density ``[..]``.
+    """
+    raw = loc + scale * noise
+    # log(1 - tanh(x)^2), which stays exact where tanh saturates
+    log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
+    log_prob = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi) - log_slope
+    return raw.tanh(), log_prob.sum(-1)
+
+
+class Memories(NamedTuple):
+    """What one encoder pass over the L+1 observations of each network gives, each ``[B, L+1, memory]``."""
+
+    actor: Tensor
+    critics: tuple[Tensor, ...]
+    targets: tuple[Tensor, ...]
+
+
+class DistributionalSACLoss(LossModule):
+    r"""Soft actor-critic whose critics are the quantile function of the return, or its mean.
+
+    With quantile critics it is RC-DSAC (networks conditioned on ``risk``) or DSAC (networks not conditioned); with
+    scalar critics it is soft actor-critic. For a transition with risk parameter :math:`\beta`:
+
+    - critic: :func:`quantile_huber_loss` at fractions :math:`\tau_i, \tau'_j \sim U(0,1)` between
+      :math:`\hat Z_{\tau_i}(s_t, a_t; \beta)` and
+      :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a_{t+1}; \beta) - \alpha \log\pi(a_{t+1}|s_{t+1},\beta))`,
+      the minimum being element-wise over the target critics, summed over the critics;
+    - actor: :math:`\alpha \log\pi - \min_k \frac1K \sum_j \hat Z^k_{\psi(\tau_j;\beta)}(s_t, a; \beta)`;
+    - temperature: :math:`-\log\alpha \, (\log\pi + \bar H)`.
+
+    Current and next step of a transition share one :math:`\beta`. Each network encodes the L+1 observations once
+    and its heads reuse the result; gradients of each loss reach only its own parameters (the actor loss
+    trains the actor's own encoder). Critics are looped over, not vmapped: a recurrent layer is faster that way.
+
+    Input: a batch ``[B, L+1]`` of sequences inside one episode. Slot ``t+1`` holds the next observation of slot
+    ``t``. Read are the observations the encoders name, and per slot ``action``, ``risk``, ``("next", "reward")``
+    and ``("next", "terminated")``; those of the last slot are ignored. The recurrent state starts at zero.
+
+    Args:
+        actor: encoder and head, from :func:`rcdsac_trl.agent.actor.build_actor`; any ``TensorDictSequential`` of two
+            modules will do whose first writes a memory ``[B, L+1, ..]`` and whose second writes ``loc``, ``scale``.
+        critics: one or two (or more) independent critics, from :func:`rcdsac_trl.agent.actor.build_critic`; the
+            head's out key decides between quantile (``"quantiles"``) and scalar (``"state_action_value"``).
+        measure: distorts the fractions of the actor loss; required with quantile critics.
+        num_quantiles: N, fractions of the prediction.
+        num_target_quantiles: N', fractions of the target.
+        num_risk_samples: K, fractions of the risk-adjusted value.
+        fractions_per: draw fractions anew for every ``"transition"``, or once a ``"sequence"``; each term of the
+            loss has the same distribution, but the gates of a sequence are then computed once.
+        kappa: threshold of the Huber loss.
+        loss_function: error of scalar critics, ``"smooth_l1"`` or ``"l2"``, as in TorchRL's SAC.
+        alpha_init: temperature at the start, above 0.
+        target_entropy: the entropy the temperature aims for, in nats.
+        burn_in: number of leading transitions of a sequence that only warm the memory up and carry no loss.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; over batch and time. ``"none"`` leaves every entry of the
+            output ``[B, L - burn_in]``.
+        generator: source of all random numbers; None for one seeded with 0. Its state is part of ``state_dict``.
+
+    Example:
+        >>> measure = PowerLaw()
+        >>> loss = DistributionalSACLoss(
+        ...     build_actor(measure=measure), [build_critic(measure=measure) for _ in range(2)], measure=measure
+        ... ).make_value_estimator(gamma=0.99)
+        >>> updater = SoftUpdate(loss, eps=0.999)
+        >>> losses = loss(batch)
+        >>> (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Default keys of the input.
+
+        Attributes:
+            action: the action taken, ``[B, L+1, A]``.
+            risk: the risk-measure parameter beta, ``[B, L+1, 1]``.
+            tau: under which quantile critics read their fractions.
+            loc: under which the actor's head writes the mean before tanh.
+            scale: under which the actor's head writes the standard deviation before tanh.
+            reward: below ``"next"``, ``[B, L+1, 1]``.
+            terminated: below ``"next"``, ``[B, L+1, 1]`` bool.
+        """
+
+        action: NestedKey = "action"
+        risk: NestedKey = "risk"
+        tau: NestedKey = "tau"
+        loc: NestedKey = "loc"
+        scale: NestedKey = "scale"
+        reward: NestedKey = "reward"
+        terminated: NestedKey = "terminated"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
+
+    actor_network: TensorDictSequential
+    critic_network: nn.ModuleList
+    actor_network_params: TensorDictParams
+    critic_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    target_critic_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor: TensorDictSequential,
+        critics: Sequence[TensorDictSequential],
+        *,
+        measure: RiskMeasure | None = None,
+        num_quantiles: int = 16,
+        num_target_quantiles: int = 16,
+        num_risk_samples: int = 16,
+        fractions_per: Literal["sequence", "transition"] = "sequence",
+        kappa: float = 1.0,
+        loss_function: Literal["smooth_l1", "l2"] = "smooth_l1",
+        alpha_init: float = 1.0,
+        target_entropy: float = -2.0,
+        burn_in: int = 0,
+        reduction: Literal["mean", "sum", "none"] = "mean",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Check the parts against each other, then make them functional."""
+        super().__init__()
+        if not critics:
+            raise ValueError("give at least one critic")
+        if min(num_quantiles, num_target_quantiles, num_risk_samples) < 1:
+            raise ValueError("the numbers of quantile fractions must be at least 1")
+        if alpha_init <= 0.0 or kappa <= 0.0:
+            raise ValueError(f"alpha_init = {alpha_init:g} and kappa = {kappa:g} must be above 0")
+        if burn_in < 0:
+            raise ValueError(f"burn_in = {burn_in} must be at least 0")
+        if fractions_per not in ("sequence", "transition"):
+            raise ValueError(f"fractions_per = {fractions_per!r} must be 'sequence' or 'transition'")
+        if loss_function not in ("smooth_l1", "l2"):
+            raise ValueError(f"loss_function = {loss_function!r} must be 'smooth_l1' or 'l2'")
+        if reduction not in ("mean", "sum", "none"):
+            raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
+        self._distributional = self.tensor_keys.tau in critics[0][-1].in_keys
+        if self._distributional and measure is None:
+            raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
+
+        self.convert_to_functional(actor, "actor_network")
+        # One functional module for all critics: their parameters keep apart (a list given to TorchRL's own
+        # conversion is stacked, which a recurrent layer without vmap cannot use).
+        self.convert_to_functional(nn.ModuleList(critics), "critic_network", create_target_params=True)
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
+        self.measure = measure
+        self.num_quantiles = num_quantiles
+        self.num_target_quantiles = num_target_quantiles
+        self.num_risk_samples = num_risk_samples
+        self.fractions_per = fractions_per
+        self.kappa = kappa
+        self.loss_function = loss_function
+        self.target_entropy = target_entropy
+        self.burn_in = burn_in
+        self.reduction = reduction
+        self._generator = generator or torch.Generator().manual_seed(0)
+
+    # ------------------------------------------------------------------------------------------- TorchRL's idiom
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+    ) -> "DistributionalSACLoss":
+        """Set the target's estimator: one-step bootstrapping (TD0) only; ``gamma`` is given here."""
+        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=self.SUPPORTED_VALUE_ESTIMATORS,
+                tensor_keys={"reward": self.tensor_keys.reward, "terminated": self.tensor_keys.terminated},
+                **hyperparams,
+            )
+        return self
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Every key the loss reads from a batch."""
+        keys: dict[NestedKey, None] = dict.fromkeys(self.actor_network[0].in_keys)
+        for critic in self.critic_network:
+            keys.update(dict.fromkeys(critic[0].in_keys))
+        keys[self.tensor_keys.action] = None
+        if self.measure is not None:
+            keys[self.tensor_keys.risk] = None
+        for key in (self.tensor_keys.reward, self.tensor_keys.terminated):
+            keys[("next", *key) if isinstance(key, tuple) else ("next", key)] = None
+        return list(keys)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Every key of the output."""
+        keys = ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "td_error", "q_value"]
+        return [*keys, "quantile_spread"] if self._distributional else keys
+
+    @property
+    def rng_state(self) -> Tensor:
+        """State of the generator that all random numbers of the loss come from."""
+        return self._generator.get_state()
+
+    @rng_state.setter
+    def rng_state(self, state: Tensor) -> None:
+        self._generator.set_state(state)
+
+    def get_extra_state(self) -> Tensor:
+        """Put the generator's state into ``state_dict``."""
+        return self.rng_state
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take the generator's state from ``state_dict``."""
+        self.rng_state = state
+
+    @property
+    def alpha(self) -> Tensor:
+        """The temperature, detached."""
+        return self.log_alpha.detach().exp()
+
+    @property
+    @_cache_values
+    def _cached_detached_critic_params(self) -> TensorDictBase:
+        return self.critic_network_params.detach()
+
+    # ------------------------------------------------------------------------------------------- the losses
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the three losses and detached diagnostics of a batch ``[B, L+1]``.
+
+        ``loss_*`` are to be summed and differentiated. ``alpha`` is the temperature, ``entropy`` the policy's in
+        nats, ``td_error`` the mean absolute pairwise temporal difference (largest over the critics), ``q_value`` the
+        mean prediction and ``quantile_spread`` the standard deviation over a prediction's sampled quantiles.
+        """
+        memories = self.encode(tensordict)
+        loss_qvalue, diagnostics = self.qvalue_loss(tensordict, memories)
+        loss_actor, log_prob = self.actor_loss(tensordict, memories)
+        loss_alpha = -self.log_alpha * (log_prob + self.target_entropy)
+        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha}
+        diagnostics |= {"alpha": self.alpha, "entropy": -log_prob}
+        if self.reduction == "none":
+            diagnostics["alpha"] = self.alpha.expand_as(log_prob)
+            return TensorDict(losses | diagnostics, batch_size=log_prob.shape)
+        losses = {key: _reduce(value, self.reduction) for key, value in losses.items()}
+        return TensorDict(losses | {key: value.mean() for key, value in diagnostics.items()})
+
+    def encode(self, tensordict: TensorDictBase) -> Memories:
+        """Run every encoder once over the whole sequences.
+
+        Raises:
+            ValueError: if the batch is not ``[B, L+1]`` with ``L`` above the burn-in.
+        """
+        if tensordict.ndim != 2 or tensordict.shape[1] < self.burn_in + 2:
+            raise ValueError(
+                f"expected a batch [sequences, steps + 1] with more than burn_in = {self.burn_in} steps, "
+                f"got {list(tensordict.shape)}"
+            )
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            actor = self._memory(self.actor_network, tensordict)
+        with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
+            critics = tuple(self._memory(critic, tensordict) for critic in self.critic_network)
+        with (
+            torch.no_grad(),
+            self.target_critic_network_params.to_module(self.critic_network, preserve_module_state=False),
+        ):
+            targets = tuple(self._memory(critic, tensordict) for critic in self.critic_network)
+        return Memories(actor, critics, targets)
+
+    def compute_target(self, tensordict: TensorDictBase, memories: Memories) -> Tensor:
+        """Return the target samples ``[B, L - burn_in, N']`` (scalar critics: N' = 1), without gradient."""
+        batch, risk = self._transitions(tensordict), self._risk(tensordict)
+        with torch.no_grad():
+            action, log_prob = self._act(memories.actor[:, 1:], risk)
+            tau = self._fractions(self.num_target_quantiles, log_prob)
+            with self.target_critic_network_params.to_module(self.critic_network, preserve_module_state=False):
+                values = [
+                    self._evaluate(critic, memory[:, 1:], action, tau, risk)
+                    for critic, memory in zip(self.critic_network, memories.targets, strict=True)
+                ]
+            next_value = _minimum(values) - self.alpha * log_prob.unsqueeze(-1)
+            # The estimator checks shapes strictly, so every target fraction gets its own entry.
+            outcome = TensorDict(batch_size=batch.batch_size)
+            keys = self.value_estimator.tensor_keys
+            terminated = batch.get(("next", self.tensor_keys.terminated)).expand_as(next_value)
+            outcome.set(("next", keys.reward), batch.get(("next", self.tensor_keys.reward)).expand_as(next_value))
+            outcome.set(("next", keys.terminated), terminated)
+            outcome.set(("next", keys.done), terminated)
+            return self.value_estimator.value_estimate(outcome, next_value=next_value)
+
+    def qvalue_loss(self, tensordict: TensorDictBase, memories: Memories) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the critic loss ``[B, L - burn_in]``, summed over the critics, and detached diagnostics."""
+        target = self.compute_target(tensordict, memories)
+        action, risk = self._transitions(tensordict).get(self.tensor_keys.action), self._risk(tensordict)
+        tau = self._fractions(self.num_quantiles, action)
+        with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
+            values = [
+                self._evaluate(critic, memory[:, :-1], action, tau, risk)
+                for critic, memory in zip(self.critic_network, memories.critics, strict=True)
+            ]
+        if self._distributional:
+            errors = [quantile_huber_loss(value, target, tau, self.kappa) for value in values]
+        else:
+            errors = [distance_loss(value, target, self.loss_function).squeeze(-1) for value in values]
+        return torch.stack(errors).sum(0), self._diagnose(values, target)
+
+    def actor_loss(self, tensordict: TensorDictBase, memories: Memories) -> tuple[Tensor, Tensor]:
+        """Return the actor loss and the detached log density of its action, both ``[B, L - burn_in]``."""
+        risk = self._risk(tensordict)
+        action, log_prob = self._act(memories.actor[:, :-1], risk)
+        tau = self._fractions(self.num_risk_samples, log_prob)
+        if tau is not None:
+            tau = self.measure.psi(tau, risk)
+        with self._cached_detached_critic_params.to_module(self.critic_network, preserve_module_state=False):
+            values = [
+                self._evaluate(critic, memory[:, :-1].detach(), action, tau, risk).mean(-1)
+                for critic, memory in zip(self.critic_network, memories.critics, strict=True)
+            ]
+        return self.alpha * log_prob - _minimum(values), log_prob.detach()
+
+    # ------------------------------------------------------------------------------------------- parts of them
+    def _memory(self, network: TensorDictSequential, tensordict: TensorDictBase) -> Tensor:
+        encoder = network[0]
+        memory = encoder(tensordict.select(*encoder.in_keys)).get(encoder.out_keys[0])
+        return memory[:, self.burn_in :]
+
+    def _transitions(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict[:, self.burn_in : -1]
+
+    def _risk(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return beta per transition, with a time dimension of 1 where it is constant along every sequence."""
+        if self.measure is None:
+            return None
+        risk = tensordict.get(self.tensor_keys.risk)[:, self.burn_in : -1]
+        first = risk[:, :1]
+        return first if torch.equal(risk, first.expand_as(risk)) else risk
+
+    def _act(self, memory: Tensor, risk: Tensor | None) -> tuple[Tensor, Tensor]:
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            entries = {self.actor_network[0].out_keys[0]: memory, self.tensor_keys.risk: risk}
+            policy = _call(self.actor_network[1], entries)
+        loc, scale = policy.get(self.tensor_keys.loc), policy.get(self.tensor_keys.scale)
+        noise = torch.randn(loc.shape, generator=self._generator, device=self._generator.device)
+        return squash(loc, scale, noise.to(loc))
+
+    def _evaluate(
+        self, critic: TensorDictSequential, memory: Tensor, action: Tensor, tau: Tensor | None, risk: Tensor | None
+    ) -> Tensor:
+        entries = {
+            critic[0].out_keys[0]: memory,
+            self.tensor_keys.action: action,
+            self.tensor_keys.tau: tau,
+            self.tensor_keys.risk: risk,
+        }
+        return _call(critic[1], entries).get(critic[1].out_keys[0])
+
+    def _fractions(self, number: int, like: Tensor) -> Tensor | None:
+        """Draw fractions ``[B, L or 1, number]`` for a tensor ``[B, L, ..]``; None for scalar critics."""
+        if not self._distributional:
+            return None
+        shape = (like.shape[0], 1 if self.fractions_per == "sequence" else like.shape[1], number)
+        return torch.rand(shape, generator=self._generator, device=self._generator.device).to(like.device)
+
+    def _diagnose(self, values: list[Tensor], target: Tensor) -> dict[str, Tensor]:
+        with torch.no_grad():
+            stacked = torch.stack(values)  # [critics, B, L, N]
+            difference = (target.mean(-1) - stacked.mean(-1)).abs().amax(0)
+            diagnostics = {"td_error": difference, "q_value": stacked.mean((0, -1))}
+            if self._distributional:
+                diagnostics["quantile_spread"] = stacked.std(-1, correction=0).mean(0)
+            return diagnostics
+
+
+def _call(head: TensorDictSequential, entries: dict[NestedKey, Tensor | None]) -> TensorDictBase:
+    """Run a head on the entries it reads; their time dimensions may be 1, so only the first is the batch's."""
+    memory = next(value for value in entries.values() if value is not None)
+    inputs = TensorDict(batch_size=memory.shape[:1])
+    for key in head.in_keys:
+        inputs.set(key, entries[key])
+    return head(inputs)
+
+
+def _minimum(values: list[Tensor]) -> Tensor:
+    """Element-wise minimum over the critics."""
+    smallest = values[0]
+    for value in values[1:]:
+        smallest = torch.minimum(smallest, value)
+    return smallest

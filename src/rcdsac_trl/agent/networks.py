@@ -1,0 +1,264 @@
+r"""The networks of RC-DSAC as plain ``nn.Module`` parts: one encoder, then heads on its output.
+
+The action, ``beta`` and :math:`\tau` enter *after* the recurrent layer (paper, "Network Architectures"), so one
+encoder pass over the observations of a sequence serves current and next step, data and policy action, every
+``beta`` and every :math:`\tau`. :mod:`rcdsac_trl.agent.actor` wires the parts to tensor keys.
+
+Public names::
+
+    Widths(conv, range, vector, memory, head, cosines)                              frozen dataclass, all defaults
+    Encoder(vectors: Mapping[str, int], widths)
+        .forward(range [B,T,180], *vectors [B,T,k]) -> memory [B,T,128]             sequence, zero initial state
+        .step(range [*,180], *vectors [*,k], is_init [*,1], state [*,128]) -> state [*,128]   (= memory)
+    ActorHead(action_size, widths, measure | None)
+        .forward(memory [..,128], risk [..,1] | None) -> loc [..,A], scale [..,A]
+    QuantileHead(action_size, widths, measure | None)
+        .forward(memory [B,L,128], action [B,L,A], tau [B,L|1,N], risk [B,L|1,1] | None) -> quantiles [B,L,N]
+    ScalarHead(action_size, widths)
+        .forward(memory [..,128], action [..,A]) -> value [..,1]
+
+Pass ``risk`` and ``tau`` with a time dimension of 1 where they are constant along a sequence: the gate is then computed
+once for it.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rcdsac_trl.agent.kernels import gated_values, range_features
+from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.errors import UserInputError
+
+#: Number of range bins of an observation.
+RANGE_SIZE = 180
+#: Bounds of the policy's log standard deviation.
+LOG_STD_RANGE = (-20.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Widths:
+    """Layer widths; the defaults are the paper's as far as it states them.
+
+    Args:
+        conv: channels of both convolutions.
+        range: features of the range observation.
+        vector: features of each vector observation.
+        memory: size of the recurrent state.
+        head: size of every fully-connected layer after the recurrent one, and of the risk gates.
+        cosines: number of cosine features of ``beta`` and of a quantile fraction.
+
+    Raises:
+        UserInputError: if a width is below 1.
+    """
+
+    conv: int = 32
+    range: int = 128
+    vector: int = 32
+    memory: int = 128
+    head: int = 128
+    cosines: int = 64
+
+    def __post_init__(self) -> None:
+        """Refuse widths below 1."""
+        for field in fields(self):
+            if getattr(self, field.name) < 1:
+                raise UserInputError(
+                    f"network width {field.name} = {getattr(self, field.name)} is below 1: give a positive integer"
+                )
+
+
+class RangeFeatures(nn.Module):
+    """Two strided convolutions and a linear layer over the range bins: ``[n, 180] -> [n, features]``.
+
+    The linear layer reads the last convolution position by position (all channels of a position together).
+    """
+
+    def __init__(self, channels: int, features: int) -> None:
+        """Build the layers for :data:`RANGE_SIZE` bins."""
+        super().__init__()
+        self.conv_1 = nn.Conv1d(1, channels, kernel_size=5, stride=2)  # 88 positions
+        self.conv_2 = nn.Conv1d(channels, channels, kernel_size=3, stride=2)  # 43 positions
+        self.linear = nn.Linear(43 * channels, features)
+
+    def forward(self, bins: Tensor) -> Tensor:
+        """Map ``[n, 180]`` to ``[n, features]``; no gradient flows to the bins."""
+        if torch.compiler.is_exporting() or torch.jit.is_tracing():
+            return self.layers(bins)
+        return range_features(bins, self.conv_1, self.conv_2, self.linear)
+
+    def layers(self, bins: Tensor) -> Tensor:
+        """Compute the same with the layers one by one, for exporters, which know these and not our kernel."""
+        positions = F.relu(self.conv_2(F.relu(self.conv_1(bins.unsqueeze(1)))))
+        return F.relu(self.linear(positions.transpose(1, 2).flatten(1)))
+
+
+class Encoder(nn.Module):
+    """Observation history to memory: per-input features, concatenated, into a GRU.
+
+    Args:
+        vectors: name and size of every vector observation besides ``range``, in the order of the call, such as
+            ``{"waypoint": 6, "velocity": 4}``; each gets its own linear layer.
+        widths: layer widths.
+
+    Example:
+        >>> encoder = Encoder({"waypoint": 6, "velocity": 4}, Widths())
+        >>> encoder(torch.zeros(2, 8, 180), torch.zeros(2, 8, 6), torch.zeros(2, 8, 4)).shape
+        torch.Size([2, 8, 128])
+    """
+
+    def __init__(self, vectors: Mapping[str, int], widths: Widths) -> None:
+        """Build the layers."""
+        super().__init__()
+        self.memory_size = widths.memory
+        self.range = RangeFeatures(widths.conv, widths.range)
+        self.vectors = nn.ModuleList(nn.Linear(size, widths.vector) for size in vectors.values())
+        self.gru = nn.GRU(widths.range + widths.vector * len(vectors), widths.memory, batch_first=True)
+
+    def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
+        """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
+        features = self._features(range_, vectors)
+        return self.gru(features)[0]
+
+    def step(self, range_: Tensor, *rest: Tensor) -> Tensor:
+        """Advance any batch ``[*]`` of agents by one observation.
+
+        Args:
+            range_: range observation ``[*, 180]``.
+            rest: the vector observations ``[*, size]``, then ``is_init`` ``[*, 1]`` (bool: this is the first
+                observation of an episode, so the state is zeroed first), then the recurrent state ``[*, memory]``.
+
+        Returns:
+            The next recurrent state ``[*, memory]``, which is also the memory the heads read.
+        """
+        *vectors, is_init, state = rest
+        features = self._features(range_, tuple(vectors))
+        lead = features.shape[:-1]
+        state = torch.where(is_init, torch.zeros_like(state), state).reshape(1, -1, self.memory_size)
+        return self.gru(features.reshape(-1, 1, features.shape[-1]), state)[1].reshape(*lead, self.memory_size)
+
+    def _features(self, range_: Tensor, vectors: tuple[Tensor, ...]) -> Tensor:
+        lead = range_.shape[:-1]
+        parts = [self.range(range_.reshape(-1, RANGE_SIZE)).reshape(*lead, -1)]
+        parts += [F.relu(layer(value)) for layer, value in zip(self.vectors, vectors, strict=True)]
+        return torch.cat(parts, dim=-1)
+
+
+class CosineFeatures(nn.Module):
+    r"""Cosine embedding: ``[..] -> [.., n]`` with elements :math:`\cos(\pi i x)`, i = 1..n, for x in [0, 1]."""
+
+    frequencies: Tensor
+
+    def __init__(self, number: int) -> None:
+        """Keep the angular frequencies as a buffer that no checkpoint carries."""
+        super().__init__()
+        self.register_buffer("frequencies", math.pi * torch.arange(1, number + 1), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Embed every element of ``x``."""
+        return torch.cos(x.unsqueeze(-1) * self.frequencies)
+
+
+class ActorHead(nn.Module):
+    r"""Memory (and ``beta``) to the mean and the standard deviation of the pre-tanh action.
+
+    :math:`g^{actor}(o_{0:t}) \odot g^{actorRisk}(\phi^\beta)`, a linear layer, then the two outputs. Without a measure there is
+    no gate: the policy of SAC, RCWR and DSAC.
+
+    Args:
+        action_size: number of action dimensions.
+        widths: layer widths.
+        measure: embeds ``beta``; None for no risk gate.
+    """
+
+    def __init__(self, action_size: int, widths: Widths, measure: RiskMeasure | None = None) -> None:
+        """Build the layers."""
+        super().__init__()
+        self.measure = measure
+        self.input = nn.Linear(widths.memory, widths.head)
+        if measure is not None:
+            self.cosines = CosineFeatures(widths.cosines)
+            self.gate = nn.Linear(widths.cosines, widths.head)
+        self.hidden = nn.Linear(widths.head, widths.head)
+        self.output = nn.Linear(widths.head, 2 * action_size)
+
+    def forward(self, memory: Tensor, risk: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return ``loc`` and ``scale`` ``[.., action]`` of the normal distribution before tanh."""
+        x = F.relu(self.input(memory))
+        if self.measure is not None:
+            if risk is None:
+                raise ValueError("this actor is conditioned on risk: pass it")
+            x = x * F.relu(self.gate(self.cosines(self.measure.embed(risk).squeeze(-1))))
+        loc, log_std = self.output(F.relu(self.hidden(x))).chunk(2, dim=-1)
+        return loc, log_std.clamp(*LOG_STD_RANGE).exp()
+
+
+class QuantileHead(nn.Module):
+    r"""Memory, action and fractions to the quantiles of the return.
+
+    :math:`g^{critic}(o_{0:t},u_t) \odot g^{criticRisk}([\phi^\beta; \phi^\tau])`, a linear layer, one output a
+    fraction. The gate's linear layer is kept as its two halves, so that the ``beta`` half and the ``tau`` half
+    are each computed at their own shape and added. Without a measure the gate depends on ``tau`` alone (DSAC).
+
+    Args:
+        action_size: number of action dimensions.
+        widths: layer widths.
+        measure: embeds ``beta``; None for a gate of ``tau`` alone.
+    """
+
+    def __init__(self, action_size: int, widths: Widths, measure: RiskMeasure | None = None) -> None:
+        """Build the layers."""
+        super().__init__()
+        self.measure = measure
+        self.input = nn.Linear(widths.memory + action_size, widths.head)
+        self.cosines = CosineFeatures(widths.cosines)
+        self.gate_tau = nn.Linear(widths.cosines, widths.head)
+        if measure is not None:
+            self.gate_beta = nn.Linear(widths.cosines, widths.head, bias=False)
+            # One linear layer over both halves draws from its whole fan-in: so do its halves.
+            bound = 1.0 / math.sqrt(2 * widths.cosines)
+            for parameter in (self.gate_tau.weight, self.gate_tau.bias, self.gate_beta.weight):
+                nn.init.uniform_(parameter, -bound, bound)
+        self.hidden = nn.Linear(widths.head, widths.head)
+        self.output = nn.Linear(widths.head, 1)
+
+    def forward(self, memory: Tensor, action: Tensor, tau: Tensor, risk: Tensor | None = None) -> Tensor:
+        """Return the quantiles ``[B, L, N]``.
+
+        Args:
+            memory: ``[B, L, memory]``.
+            action: ``[B, L, action]``.
+            tau: fractions in [0, 1], ``[B, L, N]`` or, the same along a sequence, ``[B, 1, N]``.
+            risk: ``beta``, ``[B, L, 1]`` or ``[B, 1, 1]``; not read without a measure.
+        """
+        gate = self.gate_tau(self.cosines(tau))
+        if self.measure is not None:
+            if risk is None:
+                raise ValueError("this critic is conditioned on risk: pass it")
+            gate = gate + self.gate_beta(self.cosines(self.measure.embed(risk)))
+        x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
+        return gated_values(x, F.relu(gate).expand(len(x), -1, -1, -1), self.hidden, self.output)
+
+
+class ScalarHead(nn.Module):
+    """Memory and action to one value, the mean return: the critic of SAC and RCWR.
+
+    Args:
+        action_size: number of action dimensions.
+        widths: layer widths.
+    """
+
+    def __init__(self, action_size: int, widths: Widths) -> None:
+        """Build the layers."""
+        super().__init__()
+        self.input = nn.Linear(widths.memory + action_size, widths.head)
+        self.hidden = nn.Linear(widths.head, widths.head)
+        self.output = nn.Linear(widths.head, 1)
+
+    def forward(self, memory: Tensor, action: Tensor) -> Tensor:
+        """Return the value ``[.., 1]``."""
+        x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
+        return self.output(F.relu(self.hidden(x)))

@@ -1,0 +1,131 @@
+"""The run folder and everything written into it while training."""
+
+import importlib.util
+import json
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import pandas as pd
+from omegaconf import DictConfig, OmegaConf
+from torchrl.record.loggers import Logger
+from torchrl.record.loggers.utils import get_logger
+from tqdm import tqdm
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline.metrics import METRICS, Condition
+
+CONFIG_NAME = "config.yaml"
+_EXTRAS = {"wandb": "wandb", "mlflow": "mlflow"}
+_PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "gymnasium", "hydra-core", "numpy", "numba", "rcdsac-trl")
+
+
+def check_backends(backends: Sequence[str]) -> None:
+    """Refuse an unknown logger, or one whose package is not installed."""
+    known = ("csv", "tensorboard", *_EXTRAS)
+    for backend in backends:
+        if backend not in known:
+            raise UserInputError(f"logger.backends holds {backend!r}: choose among {', '.join(known)}")
+        if backend in _EXTRAS and importlib.util.find_spec(_EXTRAS[backend]) is None:
+            raise UserInputError(
+                f"logger {backend} is not installed: pip install 'rcdsac-trl[{backend}]', or use logger=default"
+            )
+
+
+def commit() -> str:
+    """Return the commit of the checkout this package runs from (with ``+`` if changed), or ``none``."""
+    here = Path(__file__).parent
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=40", "--dirty=+", "--exclude=*"],
+            cwd=here,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=10,
+        )
+        tracked = subprocess.run(["git", "ls-files", "--error-unmatch", __file__], cwd=here, capture_output=True)
+    except (OSError, subprocess.SubprocessError):
+        return "none"
+    return described.stdout.strip() if tracked.returncode == 0 else "none"
+
+
+def start_run_folder(folder: Path, cfg: DictConfig, facts: Mapping[str, object]) -> None:
+    """Write what a run is made of: the resolved config, versions, commit and command.
+
+    Raises:
+        UserInputError: if the folder already holds a run.
+    """
+    if (folder / CONFIG_NAME).exists():
+        raise UserInputError(f"{folder} already holds a run: choose another hydra.run.dir")
+    folder.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(cfg, folder / CONFIG_NAME, resolve=True)
+    manifest = {
+        "command": [Path(sys.argv[0]).stem, *sys.argv[1:]],
+        "seed": cfg.seed,
+        "commit": commit(),
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "packages": {name: version(name) for name in _PACKAGES},
+        **facts,
+    }
+    (folder / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+
+
+class RunLog:
+    """Writes scalars through TorchRL's loggers, episodes into CSV tables, and tells the console.
+
+    Args:
+        folder: the run folder.
+        backends: TorchRL loggers, checked by :func:`check_backends`.
+    """
+
+    def __init__(self, folder: Path, backends: Sequence[str]) -> None:
+        self.folder = folder
+        self._loggers: list[Logger] = [
+            get_logger(name, logger_name=str(folder), experiment_name=name) for name in backends
+        ]
+        self._file = (folder / "train.log").open("a", buffering=1)
+
+    def scalars(self, values: Mapping[str, float], step: int) -> None:
+        """Log scalars at an agent step."""
+        for logger in self._loggers:
+            for name, value in values.items():
+                logger.log_scalar(name, value, step=step)
+
+    def episodes(self, name: str, rows: pd.DataFrame) -> None:
+        """Append one row an episode to ``<name>_episodes.csv``."""
+        path = self.folder / f"{name}_episodes.csv"
+        rows.to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.6g")
+
+    def message(self, text: str) -> None:
+        """Say something on the console (without breaking the progress bar) and in ``train.log``."""
+        tqdm.write(text)
+        self._file.write(text + "\n")
+
+    def progress(self, iteration: int, iterations: int, updates: int, record: Mapping[str, float], bar: tqdm) -> None:
+        """Say how an iteration went."""
+        rates = f"{record['time/steps_per_s']:.0f} steps/s {record['time/updates_per_s']:.1f} updates/s"
+        text = (
+            f"{iteration + 1:4d}/{iterations} {record['time/elapsed_s']:6.0f} s {updates:6d} updates  "
+            f"reward {record['train/reward']:6.1f}  collisions {record['train/collisions']:5.2f}  "
+            f"goals {record['train/goals']:4.2f}  speed {record['train/mean_speed_m_per_s']:.2f} m/s  "
+            f"contact {record['train/contact_fraction']:6.1%}  {rates}"
+        )
+        self.message(text)
+        bar.set_postfix_str(rates, refresh=False)
+        bar.update()
+
+    def validation(self, means: pd.DataFrame) -> None:
+        """Show validation, one line a condition."""
+        for row in means.to_dict("records"):
+            beta, weight = (None if row[k] != row[k] else row[k] for k in ("beta", "collision_weight"))
+            values = "  ".join(f"{metric} {row[metric]:.3g}" for metric in METRICS)
+            self.message(f"     validation {Condition(beta, weight)!s:>10}  {values}")
+
+    def close(self) -> None:
+        """Close what is open."""
+        self._file.close()

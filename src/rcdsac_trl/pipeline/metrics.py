@@ -1,0 +1,87 @@
+"""What an episode amounted to: one row of plain numbers each."""
+
+from dataclasses import dataclass
+
+import pandas as pd
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from rcdsac_trl.errors import UserInputError
+
+METRICS = ("collisions", "reward", "goals", "mean_speed_m_per_s", "contact_fraction")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What an agent is told for a whole episode: beta, a collision weight, or nothing."""
+
+    beta: float | None = None
+    collision_weight: float | None = None
+
+    def __str__(self) -> str:
+        """Name the condition in logs and tables."""
+        if self.beta is not None:
+            return f"beta={self.beta:g}"
+        if self.collision_weight is not None:
+            return f"w_coll={self.collision_weight:g}"
+        return "all"
+
+
+def contact_onsets(contact: Tensor) -> Tensor:
+    """Mark the steps at which a contact begins.
+
+    Args:
+        contact: bool ``[N, T]``, in contact during the step. Episodes begin without contact.
+
+    Returns:
+        bool ``[N, T]``: in contact, after at least one contact-free step.
+    """
+    before = torch.zeros_like(contact)
+    before[:, 1:] = contact[:, :-1]
+    return contact & ~before
+
+
+def episode_metrics(episodes: TensorDictBase) -> dict[str, Tensor]:
+    """Sum episodes up.
+
+    Args:
+        episodes: ``[N, T]`` with ``("next", "contact")``, ``("next", "goal_reached")``,
+            ``("next", "reward_components")`` and ``("next", "velocity")``.
+
+    Returns:
+        One ``[N]`` tensor for each of :data:`METRICS`. `reward` is the undiscounted sum with a collision weight of
+        1 for every algorithm, so that rows compare; `mean_speed_m_per_s` averages abs(v_c).
+    """
+    after = episodes["next"]
+    contact = after["contact"].squeeze(-1)
+    base, goal, waypoint, angular, collision = after["reward_components"].double().unbind(-1)
+    return {
+        "collisions": contact_onsets(contact).sum(1).double(),
+        "reward": (base + goal + waypoint * angular + collision).sum(1),
+        "goals": after["goal_reached"].squeeze(-1).sum(1).double(),
+        "mean_speed_m_per_s": after["velocity"][..., 0].abs().double().mean(1),
+        "contact_fraction": contact.double().mean(1),
+    }
+
+
+def summarise(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Give mean and standard deviation (over episodes, ddof 0) of every metric, and the number of episodes.
+
+    Args:
+        episodes: one row an episode, as :func:`rcdsac_trl.pipeline.evaluation.evaluate` returns them.
+        by: columns that make a group; missing values form groups of their own.
+    """
+    groups = episodes.groupby(by, dropna=False, sort=False)
+    parts = {"episodes": groups.size()}
+    for metric in METRICS:
+        parts[f"{metric}_mean"] = groups[metric].mean()
+        parts[f"{metric}_std"] = groups[metric].std(ddof=0)
+    return pd.DataFrame(parts).reset_index()
+
+
+def check_unique(conditions: list[Condition]) -> None:
+    """Refuse to measure the same thing twice, which would shrink the apparent spread."""
+    for condition in conditions:
+        if conditions.count(condition) > 1:
+            raise UserInputError(f"{condition} is given more than once: name every value once")

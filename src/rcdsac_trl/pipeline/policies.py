@@ -1,0 +1,83 @@
+"""Policies that are not the agent itself: the pursuit baseline, the warm-up, and a policy on another device."""
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from rcdsac_trl.seeding import torch_seed
+from rcdsac_trl.world.pursuit import pursuit_action
+
+
+class PursuitPolicy(TensorDictModuleBase):
+    """Drives straight to the next waypoint; see :mod:`rcdsac_trl.world.pursuit`."""
+
+    in_keys = ["waypoint"]  # noqa: RUF012 (TensorDictModuleBase's own form)
+    out_keys = ["action"]  # noqa: RUF012
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`."""
+        return tensordict.set("action", pursuit_action(tensordict["waypoint"]))
+
+
+class CollectionPolicy(TensorDictModuleBase):
+    """The agent's policy, preceded by some iterations of noisy pursuit.
+
+    Random actions press the robot against walls most of the time; a noisy pursuit controller shows the critics
+    driving, turning, goals and collisions from the first update.
+
+    Args:
+        policy: the agent's policy.
+        generator: source of all exploration noise, seeded anew for each iteration.
+        seed: root seed; iteration i uses the stream ``("exploration", i)``.
+        pursuit_iterations: first iterations driven by pursuit.
+        pursuit_noise: standard deviation of the noise on its actions.
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        *,
+        generator: torch.Generator,
+        seed: int,
+        pursuit_iterations: int,
+        pursuit_noise: float,
+    ) -> None:
+        super().__init__()
+        self.in_keys = policy.in_keys
+        self.out_keys = policy.out_keys
+        self.policy = policy
+        self.generator = generator
+        self.seed = seed
+        self.pursuit_iterations = pursuit_iterations
+        self.pursuit_noise = pursuit_noise
+        self._pursuing = False
+
+    def set_iteration(self, iteration: int) -> None:
+        """Choose the driver and the noise of an iteration."""
+        self._pursuing = iteration < self.pursuit_iterations
+        self.generator.manual_seed(torch_seed(self.seed, "exploration", iteration))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` and the agent's other outputs, which stay the agent's own while pursuit drives."""
+        tensordict = self.policy(tensordict)
+        if self._pursuing:
+            action = pursuit_action(tensordict["waypoint"])
+            noise = torch.empty_like(action).normal_(generator=self.generator)
+            tensordict["action"] = (action + self.pursuit_noise * noise).clamp(-1.0, 1.0)
+        return tensordict
+
+
+class OnDevice(TensorDictModuleBase):
+    """Runs a policy on its device for an environment on the CPU."""
+
+    def __init__(self, policy: TensorDictModuleBase, device: torch.device | str) -> None:
+        super().__init__()
+        self.in_keys = policy.in_keys
+        self.out_keys = policy.out_keys
+        self.policy = policy
+        self.device = torch.device(device)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the policy's outputs on the CPU."""
+        out = self.policy(tensordict.select(*self.in_keys).to(self.device))
+        return tensordict.update(out.select(*self.out_keys).to("cpu"))

@@ -1,0 +1,68 @@
+"""What the process itself needs: an allocator that keeps its pages, a device and threads.
+
+This module is imported before torch, so that a re-executed process has paid nothing twice.
+"""
+
+import os
+import sys
+
+from rcdsac_trl.errors import UserInputError
+
+# glibc maps and unmaps every large temporary by default, which costs more than the arithmetic on it.
+_GLIBC_KEEPS_PAGES = {
+    "MALLOC_MMAP_MAX_": "0",
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 40),
+    "MALLOC_TOP_PAD_": str(1 << 26),
+}
+
+
+def keep_pages() -> None:
+    """Start this process again with an allocator that keeps its pages, once, on Linux.
+
+    The settings only work from a process's first moment. A user who has set one of them, or preloads another
+    allocator, is left alone; C libraries other than glibc ignore them.
+    """
+    if sys.platform != "linux" or "LD_PRELOAD" in os.environ:
+        return
+    if any(name in os.environ for name in _GLIBC_KEEPS_PAGES):
+        return
+    os.execve(sys.executable, sys.orig_argv, os.environ | _GLIBC_KEEPS_PAGES)
+
+
+def allocator() -> str:
+    """Name the allocator's state for the log."""
+    if "LD_PRELOAD" in os.environ:
+        return f"preloaded ({os.environ['LD_PRELOAD']})"
+    kept = all(os.environ.get(name) == value for name, value in _GLIBC_KEEPS_PAGES.items())
+    return "glibc that keeps its pages" if kept else "the system's default"
+
+
+def resolve_device(name: str) -> str:
+    """Turn ``auto`` into CUDA where there is one, else the CPU.
+
+    Raises:
+        UserInputError: if the named device is not on this machine.
+    """
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise UserInputError(f"device={name} is no device of torch: use auto, cpu or cuda") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise UserInputError(f"device={name}, but torch sees no CUDA here: use device=auto or device=cpu")
+    return name
+
+
+def set_threads(threads: int | str) -> int:
+    """Set how many threads torch uses for one operation; ``auto`` takes the cores this process may use."""
+    import torch
+
+    if threads == "auto":
+        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not isinstance(threads, int) or threads < 1:
+        raise UserInputError(f"threads={threads} is not a whole number of at least 1: use that or auto")
+    torch.set_num_threads(threads)
+    return threads

@@ -1,0 +1,209 @@
+"""The training loop: a new map and its episodes, then updates; look at the agent, save it, say how it goes."""
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pandas as pd
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.objectives import LossModule, SoftUpdate
+from tqdm import tqdm
+
+from rcdsac_trl.pipeline.checkpoint import Checkpoints
+from rcdsac_trl.pipeline.logs import RunLog
+from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics
+from rcdsac_trl.pipeline.replay import SequenceReplay
+from rcdsac_trl.pipeline.settings import Schedule
+
+LOSS_KEYS = ("loss_qvalue", "loss_actor", "loss_alpha")
+
+
+class Learner:
+    """One update: a batch, a beta for it, one backward pass, every optimiser, the target critics.
+
+    Args:
+        replay: gives batches of sequences.
+        loss: returns ``loss_qvalue``, ``loss_actor``, ``loss_alpha`` with isolated gradients, and diagnostics.
+        relabel: sets the `risk` of a batch for a given fraction of beta's range.
+        optimizer: holds the parameters of all three losses.
+        targets: moves the target critics.
+        clipped: groups of parameters whose gradient norm is clipped together, and the limit; None: no clipping.
+    """
+
+    def __init__(
+        self,
+        *,
+        replay: SequenceReplay,
+        loss: LossModule,
+        relabel: Callable[[TensorDictBase, float], TensorDictBase],
+        optimizer: torch.optim.Optimizer,
+        targets: SoftUpdate,
+        clipped: list[list[nn.Parameter]],
+        max_grad_norm: float | None,
+    ) -> None:
+        self.replay = replay
+        self.loss = loss
+        self.relabel = relabel
+        self.optimizer = optimizer
+        self.targets = targets
+        self.clipped = clipped
+        self.max_grad_norm = max_grad_norm
+
+    def update(self, range_fraction: float) -> dict[str, Tensor]:
+        """Do one update and return the losses and diagnostics, detached and still on the device."""
+        batch = self.relabel(self.replay.sample(), range_fraction)
+        losses = self.loss(batch)
+        # One backward pass serves all three: the loss isolates their gradients.
+        torch.stack([losses[key] for key in LOSS_KEYS]).sum().backward()
+        if self.max_grad_norm is not None:
+            for parameters in self.clipped:
+                nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.targets.step()
+        return {key: value.detach() for key, value in losses.items()}
+
+    def updates(self, number: int, range_fraction: float) -> dict[str, float]:
+        """Do many updates and return the mean of everything :meth:`update` returns."""
+        sums: dict[str, Tensor] = {}
+        for _ in range(number):
+            for key, value in self.update(range_fraction).items():
+                sums[key] = sums[key] + value if key in sums else value.clone()
+        return {key: (value / number).item() for key, value in sums.items()}
+
+
+class Trainer:
+    """Runs a :class:`Schedule`.
+
+    Args:
+        schedule: the layout of the run.
+        collector: yields the episodes of one iteration, ``[..., T]``.
+        set_iteration: told the iteration whose episodes are about to be collected.
+        learner: does the updates.
+        validate: returns one row an episode on validation maps.
+        validate_every: iterations between validations.
+        checkpoints: where the agent is saved.
+        checkpoint_every: iterations between checkpoints.
+        log: where everything is written.
+        context_key: what tells episodes apart in the log: ``"risk"``, ``"collision_weight"`` or None.
+    """
+
+    def __init__(
+        self,
+        *,
+        schedule: Schedule,
+        collector: Collector,
+        set_iteration: Callable[[int], None],
+        learner: Learner,
+        validate: Callable[[], pd.DataFrame],
+        validate_every: int,
+        checkpoints: Checkpoints,
+        checkpoint_every: int,
+        log: RunLog,
+        context_key: str | None,
+    ) -> None:
+        self.schedule = schedule
+        self.collector = collector
+        self.set_iteration = set_iteration
+        self.learner = learner
+        self.validate = validate
+        self.validate_every = validate_every
+        self.checkpoints = checkpoints
+        self.checkpoint_every = checkpoint_every
+        self.log = log
+        self.context_key = context_key
+        self.steps = 0
+        self.updates = 0
+        self.best_score = float("-inf")
+
+    def run(self) -> None:
+        """Train to the end of the schedule; Ctrl-C ends it early, with a checkpoint."""
+        self.log.message(f"{self.schedule.iterations} iterations; write to {self.log.folder}")
+        started = time.monotonic()
+        episodes = self._episodes()
+        iteration = 0
+        with tqdm(total=self.schedule.iterations, unit="it", disable=None, smoothing=0.1) as bar:
+            try:
+                for iteration in range(self.schedule.iterations):
+                    record = self._iterate(iteration, episodes)
+                    record["time/elapsed_s"] = time.monotonic() - started
+                    self.log.scalars(record, self.steps)
+                    self.log.progress(iteration, self.schedule.iterations, self.updates, record, bar)
+            except KeyboardInterrupt:
+                self.log.message(f"interrupted in iteration {iteration}: save and stop")
+                self._save(iteration)
+                raise
+            finally:
+                self.collector.shutdown()
+                self.log.close()
+
+    def _episodes(self) -> Iterator[TensorDictBase]:
+        for batch in self.collector:
+            yield batch.reshape(-1, batch.shape[-1])
+
+    def _iterate(self, iteration: int, episodes: Iterator[TensorDictBase]) -> dict[str, float]:
+        self.set_iteration(iteration)
+        fraction = self.schedule.range_fraction(iteration)
+        t0 = time.monotonic()
+        batch = next(episodes)
+        t1 = time.monotonic()
+        self.learner.replay.add_episodes(batch)
+        self.steps += batch.numel()
+        diagnostics = self.learner.updates(self.schedule.updates_per_iteration, fraction)
+        self.updates += self.schedule.updates_per_iteration
+        t2 = time.monotonic()
+        record = self._training_record(iteration, batch)
+        record |= {f"learn/{key}": value for key, value in diagnostics.items()}
+        record |= {
+            "learn/range_fraction": fraction,
+            "learn/updates": float(self.updates),
+            "time/steps_per_s": batch.numel() / (t1 - t0),
+            "time/updates_per_s": self.schedule.updates_per_iteration / max(t2 - t1, 1e-9),
+        }
+        last = iteration + 1 == self.schedule.iterations
+        if last or (iteration + 1) % self.validate_every == 0:
+            record |= self._validate(iteration)
+        if last or (iteration + 1) % self.checkpoint_every == 0:
+            self._save(iteration)
+        return record
+
+    def _training_record(self, iteration: int, batch: TensorDictBase) -> dict[str, float]:
+        metrics = episode_metrics(batch)
+        rows = pd.DataFrame({key: value.numpy() for key, value in metrics.items()})
+        if self.context_key is not None:
+            rows.insert(0, self.context_key, batch[self.context_key][:, 0, 0].cpu().numpy())
+        rows.insert(0, "episode", range(len(rows)))
+        rows.insert(0, "iteration", iteration)
+        rows.insert(1, "updates", self.updates)
+        self.log.episodes("training", rows)
+        return {f"train/{metric}": float(rows[metric].mean()) for metric in METRICS}
+
+    def _validate(self, iteration: int) -> dict[str, float]:
+        rows = self.validate()
+        rows.insert(0, "iteration", iteration)
+        rows.insert(1, "updates", self.updates)
+        self.log.episodes("validation", rows)
+        conditions = ["beta", "collision_weight"]
+        by_condition = rows.groupby(conditions, dropna=False)[list(METRICS)].mean()
+        self.log.validation(by_condition.reset_index())
+        score = float(by_condition["reward"].mean())
+        if score > self.best_score:
+            self.best_score = score
+            self._save(iteration, best=True)
+        record = {"validation/score": score}
+        for (beta, weight), values in by_condition.iterrows():
+            label = next((f"{x:g}" for x in (beta, weight) if x == x), "all")
+            record |= {f"validation/{metric}/{label}": float(values[metric]) for metric in METRICS}
+        return record
+
+    def _save(self, iteration: int, *, best: bool = False) -> Path:
+        progress = {
+            "iteration": iteration,
+            "steps": self.steps,
+            "updates": self.updates,
+            "best_score": self.best_score,
+        }
+        return self.checkpoints.save("best" if best else "last", progress)

@@ -1,0 +1,328 @@
+"""The core of the environment: agents, their episodes, starts, goals, waypoints, contact onsets and reward.
+
+It knows neither TorchRL nor Gymnasium: :mod:`rcdsac_trl.world.env` and :mod:`rcdsac_trl.world.gym` are thin
+adapters over :class:`AgentGroup`.
+
+Everything random in episode ``k`` of agent ``i`` comes from ``stream(seed, "<purpose>/<split>", k, i, ...)``,
+and each goal is drawn relative to the goal before it. So maps, starts, goals and control periods are the same
+whatever the agent does, and whichever group and process holds it.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.seeding import stream
+from rcdsac_trl.world import task as rules
+from rcdsac_trl.world.lidar import NUM_BINS, sensor_mask
+from rcdsac_trl.world.maps import SPLITS, MapSettings, Split, generate_map
+from rcdsac_trl.world.planner import Planner
+from rcdsac_trl.world.render import Scene
+from rcdsac_trl.world.shapes import Map
+from rcdsac_trl.world.simulation import Simulation
+from rcdsac_trl.world.spaces import ACTION_SIZE, Buffers
+from rcdsac_trl.world.task import TaskSettings
+
+Pose = tuple[float, float, float]
+
+# The agents of a process walk through the maps together. A few more maps stay, so that an agent that was
+# reset alone, or an evaluation beside the training, does not make the others' map again.
+_MAPS_KEPT = 8
+_TRAIL_STEPS = 1000
+# A tanh or a clamp in float32 stays within 1; this forgives rounding in other arithmetic.
+_ACTION_TOLERANCE = 1e-6
+
+
+@lru_cache(maxsize=_MAPS_KEPT)
+def load_map(settings: MapSettings, split: Split, seed: int, index: int) -> tuple[Map, Planner]:
+    """Return a map and its planner, shared by all agents of this process.
+
+    Args:
+        settings: how maps are generated.
+        split: which of the disjoint map sets.
+        seed: root seed.
+        index: which map; episode ``k`` of every agent takes place on map ``k``.
+    """
+    map_ = generate_map(settings, split, seed, index)
+    return map_, Planner(map_)
+
+
+class NavigationAgent:
+    """One robot in its own simulation.
+
+    The simulation is made at the first reset, so that making an agent costs nothing.
+
+    Args:
+        map_settings: how maps are generated.
+        task: rules of the task.
+        mask: bins that the sensor has, bool [180].
+        split: which of the disjoint map sets.
+        agent_id: the agent's global number, which its random streams derive from.
+        gui: show PyBullet's window.
+    """
+
+    def __init__(
+        self,
+        map_settings: MapSettings,
+        task: TaskSettings,
+        mask: NDArray[np.bool_],
+        split: Split,
+        agent_id: int,
+        gui: bool = False,
+    ) -> None:
+        self._map_settings = map_settings
+        self._task = task
+        self._mask = mask
+        self._split = split
+        self._agent_id = agent_id
+        self._gui = gui
+        self._simulation: Simulation | None = None
+        self._trail: deque[tuple[float, float]] = deque(maxlen=_TRAIL_STEPS)
+
+    def reset(self, seed: int, episode: int) -> None:
+        """Begin an episode, on the map of the same number."""
+        self._seed, self._episode = seed, episode
+        self._map, self._planner = load_map(self._map_settings, self._split, seed, episode)
+        rng = self._stream("start")
+        x, y = self._planner.sample_free(rng).tolist()
+        self.pose: Pose = (x, y, rng.uniform(-math.pi, math.pi))
+        self._motor_steps = int(self._stream("motor_steps").choice(self._task.motor_steps))
+        if self._simulation is None:
+            self._simulation = Simulation(gui=self._gui)
+        self._simulation.load(self._map, self._planner, self.pose, self._stream("movers"))
+        self._noise = self._stream("noise")
+        self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._task.action_delay_steps)
+        self._goals_drawn = 0
+        self._goal = np.array([x, y])
+        self._draw_goal()
+        self._trail.clear()
+        self.in_contact = self.goal_reached = False
+        self.velocities = (0.0, 0.0, 0.0, 0.0)
+        self._sense()
+
+    def step(self, action: Sequence[float]) -> NDArray[np.float32]:
+        """Take one agent step and return the reward's components, float32 [5]."""
+        task = self._task
+        v_u, omega_u = rules.desired_velocities(action)
+        self._delayed.append((v_u, omega_u))
+        moved = self._require_simulation().step(*self._delayed.popleft(), self._motor_steps)
+        collided = rules.collision_due(moved.in_contact, self.in_contact, task.collision_penalty_mode)
+        self.in_contact = moved.in_contact
+        self.pose = moved.pose
+        # The step is paid for progress to the waypoint that was next while it was taken.
+        _, bearing = rules.distance_and_bearing(self.pose, self._path[self._next])
+        self.goal_reached = self._distance_to(self._goal) < task.goal_radius_m
+        components = rules.reward_components(
+            moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached
+        )
+        if self.goal_reached:
+            self._draw_goal()
+        else:
+            self._take_waypoints()
+        v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, task.odometry_noise_std, self._noise)
+        self.velocities = (v_c, omega_c, v_u, omega_u)
+        self._sense()
+        return components
+
+    @property
+    def next_waypoints(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The next waypoint and the one after it, [2] each, m; on the last leg both are the goal."""
+        return self._path[self._next], self._path[min(self._next + 1, len(self._path) - 1)]
+
+    def scene(self) -> Scene:
+        """Return what a picture of this moment shows."""
+        simulation = self._require_simulation()
+        return Scene(
+            map=self._map,
+            pose=self.pose,
+            distances_m=self.distances_m,
+            sensor_mask=self._mask,
+            waypoints=self._path[self._next :],
+            movers=np.column_stack([simulation.mover_positions, simulation.mover_radii]),
+            trail=tuple(self._trail),
+            in_contact=self.in_contact,
+        )
+
+    def close(self) -> None:
+        """Disconnect from the physics engine."""
+        if self._simulation is not None:
+            self._simulation.close()
+            self._simulation = None
+
+    def _require_simulation(self) -> Simulation:
+        if self._simulation is None:
+            raise UserInputError(
+                "the environment was stepped or drawn before its first reset; call reset() first"
+            )
+        return self._simulation
+
+    def _stream(self, purpose: str, *index: int) -> np.random.Generator:
+        return stream(self._seed, f"{purpose}/{self._split}", self._episode, self._agent_id, *index)
+
+    def _draw_goal(self) -> None:
+        """Draw the next goal relative to the last one, and plan to it from where the robot is."""
+        rng = self._stream("goal", self._goals_drawn)
+        self._goals_drawn += 1
+        self._goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
+        self._path = self._planner.waypoints(self.pose[:2], self._goal)
+        self._next = 0
+        self._take_waypoints()
+
+    def _take_waypoints(self) -> None:
+        """Pass every corner point within reach; the goal itself stays until it is reached."""
+        last = len(self._path) - 1
+        while self._next < last and self._distance_to(self._path[self._next]) < self._task.waypoint_radius_m:
+            self._next += 1
+
+    def _distance_to(self, point: Sequence[float] | NDArray[np.float64]) -> float:
+        return math.hypot(point[0] - self.pose[0], point[1] - self.pose[1])
+
+    def _sense(self) -> None:
+        self._trail.append(self.pose[:2])
+        task = self._task
+        distances = self._require_simulation().scan()
+        self.distances_m = rules.noisy_ranges(
+            distances, task.range_noise_std_m, task.range_dropout, self._noise
+        )
+
+
+class AgentGroup:
+    """The agents that one environment holds, each in its own simulation and with its own episode counter.
+
+    Args:
+        map_settings: how maps are generated.
+        task: rules of the task.
+        sensor: one of :data:`rcdsac_trl.world.lidar.SENSORS`.
+        split: which of the disjoint map sets.
+        seed: root seed, at least 0.
+        agent_ids: the agents' global numbers, different and at least 0.
+        first_episode: number of each agent's first episode, at least 0.
+        gui: show PyBullet's window for the first agent.
+
+    Attributes:
+        buffers: what the agents wrote last, overwritten by every reset and step.
+
+    Raises:
+        UserInputError: a value is outside its limits.
+    """
+
+    def __init__(
+        self,
+        map_settings: MapSettings | None,
+        task: TaskSettings | None,
+        *,
+        sensor: str,
+        split: Split,
+        seed: int,
+        agent_ids: Sequence[int],
+        first_episode: int,
+        gui: bool,
+    ) -> None:
+        if split not in SPLITS:
+            raise UserInputError(f"split={split!r} does not exist; choose one of {', '.join(SPLITS)}")
+        if not agent_ids or min(agent_ids) < 0:
+            raise UserInputError(f"agent_ids={list(agent_ids)} must be one or more whole numbers of at least 0")
+        self.task = task or TaskSettings()
+        mask = sensor_mask(sensor)
+        self._agents = [
+            NavigationAgent(
+                map_settings or MapSettings(),
+                self.task,
+                mask,
+                split,
+                agent_id,
+                gui=gui and row == 0,  # PyBullet opens one window a process
+            )
+            for row, agent_id in enumerate(agent_ids)
+        ]
+        self._mask = mask
+        self._first_episode = _not_negative("first_episode", first_episode)
+        self._distances = np.full((len(agent_ids), NUM_BINS), np.inf)
+        self.buffers = Buffers.zeros(len(agent_ids))
+        self.set_seed(seed)
+
+    def __len__(self) -> int:
+        """Return the number of agents."""
+        return len(self._agents)
+
+    def set_seed(self, seed: int) -> None:
+        """Set the root seed; the next reset of each agent begins its first episode."""
+        self._seed = _not_negative("seed", seed)
+        self._next_episodes = [self._first_episode] * len(self)
+
+    def reset(self, rows: Iterable[int], episode: int | None = None) -> None:
+        """Begin an episode of some agents: their next one, or the given one, from which they count on."""
+        buffers = self.buffers
+        for row in rows:
+            number = self._next_episodes[row] if episode is None else _not_negative("episode", episode)
+            self._agents[row].reset(self._seed, number)
+            self._next_episodes[row] = number + 1
+            buffers.reward_components[row] = 0.0
+            buffers.reward[row] = 0.0
+            self._collect(row)
+        self._see()
+
+    def step(self, actions: NDArray, collision_weights: NDArray | None = None) -> None:
+        """Take one agent step with every agent.
+
+        Args:
+            actions: normalised actions, [n, 2], in [-1, 1].
+            collision_weights: factor of each agent's collision reward, [n], None for 1; the components are
+                written without it.
+
+        Raises:
+            UserInputError: an action is not a number in [-1, 1], or an agent was never reset.
+        """
+        buffers = self.buffers
+        for row, (agent, action) in enumerate(zip(self._agents, self._checked(actions), strict=True)):
+            buffers.reward_components[row] = agent.step(action)
+            self._collect(row)
+        weights = 1.0 if collision_weights is None else collision_weights
+        buffers.reward[:, 0] = rules.total_reward(buffers.reward_components, weights)
+        self._see()
+
+    def scene(self, row: int) -> Scene:
+        """Return what a picture of one agent shows."""
+        return self._agents[row].scene()
+
+    def close(self) -> None:
+        """Disconnect all simulations."""
+        for agent in self._agents:
+            agent.close()
+
+    def _checked(self, actions: NDArray) -> list[list[float]]:
+        # The comparison is false for NaN too.
+        if (
+            actions.shape != (len(self), ACTION_SIZE)
+            or not (np.abs(actions) <= 1.0 + _ACTION_TOLERANCE).all()
+        ):
+            raise UserInputError(
+                f"actions {actions.tolist()} must be {ACTION_SIZE} numbers in [-1, 1] for each of "
+                f"{len(self)} agents; look for NaN in the policy, or scale its output"
+            )
+        values: list[list[float]] = actions.tolist()
+        return values
+
+    def _collect(self, row: int) -> None:
+        agent, buffers = self._agents[row], self.buffers
+        buffers.pose[row] = agent.pose
+        buffers.waypoint[row] = rules.waypoint_observation(agent.pose, *agent.next_waypoints)
+        buffers.velocity[row] = rules.velocity_observation(*agent.velocities)
+        buffers.contact[row, 0] = agent.in_contact
+        buffers.goal_reached[row, 0] = agent.goal_reached
+        self._distances[row] = agent.distances_m
+
+    def _see(self) -> None:
+        """Write the range observations of all agents at once, which costs little more than one agent's."""
+        self.buffers.range[:] = rules.range_observation(self._distances, self._mask)
+
+
+def _not_negative(name: str, value: int) -> int:
+    if not isinstance(value, int | np.integer) or value < 0:
+        raise UserInputError(f"{name}={value!r} must be a whole number of at least 0")
+    return int(value)

@@ -1,0 +1,356 @@
+"""Compiled plane geometry and grid search, shared by the map generator and the planner.
+
+Shapes come as ``boxes`` float64 [n, 6] (x, y, half_x, half_y, cos yaw, sin yaw) and ``circles`` float64
+[m, 3] (x, y, radius). Cell ``[row, column]`` of a grid has its centre at ``((column + 0.5) * cell_m,
+(row + 0.5) * cell_m)``. Distances are exact and never rounded to the grid.
+
+Why a path over free cells is safe: if the two ends of a leg of length L are at least d from a point, every
+point between them is at least sqrt(d^2 - L^2 / 4) from it (Stewart's theorem); :func:`leg_clearance_m` is
+that bound for the longest leg of a grid, the diagonal. So a leg between neighbouring free cells, diagonal
+or not, never comes nearer than that to anything, whatever lies between the cells' centres.
+
+Everything that is compiled stays in this one file: Numba's cache notices a change of the file that holds
+a function, not of the files that function calls into.
+"""
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+CELL_M = 0.1
+"""Side of a grid cell, m."""
+
+ROBOT_RADIUS_M = 0.25
+"""Circumradius of the octagonal robot, m."""
+
+_SQRT2 = math.sqrt(2.0)
+
+
+def leg_clearance_m(clearance_m: float, cell_m: float = CELL_M) -> float:
+    """Return the clearance of every leg between neighbouring cells of at least ``clearance_m``, m."""
+    return math.sqrt(clearance_m**2 - 0.5 * cell_m**2)
+
+
+@numba.njit(cache=True)
+def _point_box(x: float, y: float, half_x: float, half_y: float) -> float:
+    """Return the distance from a point in the box's frame to the solid box, 0 inside."""
+    dx = max(abs(x) - half_x, 0.0)
+    dy = max(abs(y) - half_y, 0.0)
+    return math.sqrt(dx * dx + dy * dy)
+
+
+@numba.njit(cache=True)
+def _point_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
+    dx, dy = bx - ax, by - ay
+    length2 = dx * dx + dy * dy
+    t = 0.0
+    if length2 > 0.0:
+        t = min(max(((px - ax) * dx + (py - ay) * dy) / length2, 0.0), 1.0)
+    return math.hypot(ax + t * dx - px, ay + t * dy - py)
+
+
+@numba.njit(cache=True)
+def _segment_enters_box(ax: float, ay: float, bx: float, by: float, hx: float, hy: float) -> bool:
+    """Clip the segment a-b to the slab of each axis; something is left when it meets the solid box."""
+    t0, t1 = 0.0, 1.0
+    for start, delta, half in ((ax, bx - ax, hx), (ay, by - ay, hy)):
+        if delta == 0.0:
+            if abs(start) > half:
+                return False
+        else:
+            u, v = (-half - start) / delta, (half - start) / delta
+            t0, t1 = max(t0, min(u, v)), min(t1, max(u, v))
+    return t0 <= t1
+
+
+@numba.njit(cache=True)
+def _segment_box(ax: float, ay: float, bx: float, by: float, hx: float, hy: float) -> float:
+    """Return the distance from a segment in the box's frame to the solid box."""
+    if _segment_enters_box(ax, ay, bx, by, hx, hy):
+        return 0.0
+    # Two convex shapes that do not meet are nearest at a corner of one of them.
+    best = min(_point_box(ax, ay, hx, hy), _point_box(bx, by, hx, hy))
+    for sx in (-hx, hx):
+        for sy in (-hy, hy):
+            best = min(best, _point_segment(sx, sy, ax, ay, bx, by))
+    return best
+
+
+@numba.njit(cache=True)
+def segment_clearance(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    boxes: NDArray[np.float64],
+    circles: NDArray[np.float64],
+    limit_m: float,
+) -> float:
+    """Return the exact distance from the segment a-b to the nearest solid shape, cut off at ``limit_m``.
+
+    With ``a == b`` it is the clearance of a point.
+    """
+    best = limit_m
+    for i in range(boxes.shape[0]):
+        x, y, hx, hy, cos, sin = boxes[i]
+        if _point_segment(x, y, ax, ay, bx, by) - math.sqrt(hx * hx + hy * hy) >= best:
+            continue
+        ux, uy = ax - x, ay - y
+        vx, vy = bx - x, by - y
+        distance = _segment_box(
+            cos * ux + sin * uy, cos * uy - sin * ux, cos * vx + sin * vy, cos * vy - sin * vx, hx, hy
+        )
+        best = min(best, distance)
+    for i in range(circles.shape[0]):
+        distance = _point_segment(circles[i, 0], circles[i, 1], ax, ay, bx, by) - circles[i, 2]
+        best = min(best, max(distance, 0.0))
+    return best
+
+
+@numba.njit(cache=True)
+def lower_clearance(
+    clearance: NDArray[np.float64],
+    boxes: NDArray[np.float64],
+    circles: NDArray[np.float64],
+    reach_m: float,
+    cell_m: float,
+) -> None:
+    """Lower each cell's clearance to its centre's exact distance to the given solid shapes, in place.
+
+    Only the cells within ``reach_m`` of a shape are visited, so ``clearance`` is exact up to ``reach_m``.
+    """
+    rows, columns = clearance.shape
+    for i in range(boxes.shape[0]):
+        x, y, hx, hy, cos, sin = boxes[i]
+        extent_x = abs(cos) * hx + abs(sin) * hy + reach_m
+        extent_y = abs(sin) * hx + abs(cos) * hy + reach_m
+        for row in range(max(int((y - extent_y) / cell_m), 0), min(int((y + extent_y) / cell_m) + 1, rows)):
+            uy = (row + 0.5) * cell_m - y
+            first = max(int((x - extent_x) / cell_m), 0)
+            for column in range(first, min(int((x + extent_x) / cell_m) + 1, columns)):
+                ux = (column + 0.5) * cell_m - x
+                distance = _point_box(cos * ux + sin * uy, cos * uy - sin * ux, hx, hy)
+                clearance[row, column] = min(clearance[row, column], distance)
+    for i in range(circles.shape[0]):
+        x, y, radius = circles[i]
+        extent = radius + reach_m
+        for row in range(max(int((y - extent) / cell_m), 0), min(int((y + extent) / cell_m) + 1, rows)):
+            uy = (row + 0.5) * cell_m - y
+            first = max(int((x - extent) / cell_m), 0)
+            for column in range(first, min(int((x + extent) / cell_m) + 1, columns)):
+                distance = max(math.hypot((column + 0.5) * cell_m - x, uy) - radius, 0.0)
+                clearance[row, column] = min(clearance[row, column], distance)
+
+
+@numba.njit(cache=True)
+def nearest_cell(free: NDArray[np.bool_], x: float, y: float, cell_m: float) -> int:
+    """Return the flat index of the free cell whose centre is nearest to a point, -1 when none is free."""
+    rows, columns = free.shape
+    best, nearest = np.inf, -1
+    for row in range(rows):
+        dy = (row + 0.5) * cell_m - y
+        for column in range(columns):
+            dx = (column + 0.5) * cell_m - x
+            if free[row, column] and dx * dx + dy * dy < best:
+                best = dx * dx + dy * dy
+                nearest = row * columns + column
+    return nearest
+
+
+@numba.njit(cache=True)
+def label_components(free: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
+    """Number the 8-connected components of the free cells 1, 2, ...; 0 is what is not free."""
+    rows, columns = free.shape
+    labels = np.zeros((rows, columns), np.int32)
+    stack = np.empty(rows * columns, np.int32)
+    count = 0
+    for seed in range(rows * columns):
+        if not free[seed // columns, seed % columns] or labels[seed // columns, seed % columns] > 0:
+            continue
+        count += 1
+        labels[seed // columns, seed % columns] = count
+        stack[0] = seed
+        size = 1
+        while size > 0:
+            size -= 1
+            row, column = stack[size] // columns, stack[size] % columns
+            for r in range(max(row - 1, 0), min(row + 2, rows)):
+                for c in range(max(column - 1, 0), min(column + 2, columns)):
+                    if free[r, c] and labels[r, c] == 0:
+                        labels[r, c] = count
+                        stack[size] = r * columns + c
+                        size += 1
+    return labels, count
+
+
+@numba.njit(cache=True)
+def keeps_connected(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> bool:
+    """Tell whether the cells free in both that are connected in ``before`` still are in ``after``."""
+    old, num_old = label_components(before)
+    new, _ = label_components(after)
+    heir = np.zeros(num_old + 1, np.int32)
+    for row in range(before.shape[0]):
+        for column in range(before.shape[1]):
+            if before[row, column] and after[row, column]:
+                label = old[row, column]
+                if heir[label] == 0:
+                    heir[label] = new[row, column]
+                elif heir[label] != new[row, column]:
+                    return False
+    return True
+
+
+@numba.njit(cache=True)
+def _push(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int, cost: float, node: int) -> None:
+    """Add an entry to a binary heap of ``size`` entries; ties go to the smaller node, so order is fixed."""
+    i = size
+    while i > 0:
+        parent = (i - 1) >> 1
+        if costs[parent] < cost or (costs[parent] == cost and nodes[parent] <= node):
+            break
+        costs[i], nodes[i] = costs[parent], nodes[parent]
+        i = parent
+    costs[i], nodes[i] = cost, node
+
+
+@numba.njit(cache=True)
+def _pop(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int) -> int:
+    """Remove the least entry of a binary heap of ``size`` entries and return its node."""
+    least = nodes[0]
+    cost, node = costs[size - 1], nodes[size - 1]
+    i = 0
+    while True:
+        child = 2 * i + 1
+        if child >= size - 1:
+            break
+        right = child + 1
+        if right < size - 1 and (
+            costs[right] < costs[child] or (costs[right] == costs[child] and nodes[right] < nodes[child])
+        ):
+            child = right
+        if cost < costs[child] or (cost == costs[child] and node <= nodes[child]):
+            break
+        costs[i], nodes[i] = costs[child], nodes[child]
+        i = child
+    costs[i], nodes[i] = cost, node
+    return least
+
+
+@numba.njit(cache=True)
+def cheapest_path(free: NDArray[np.bool_], weight: NDArray[np.float64], start: int, goal: int) -> NDArray[np.int32]:
+    """Return the cheapest 8-connected path over free cells by A*, both ends included.
+
+    A step costs its length in cells times the mean weight of its two cells; no weight is below 1. Cells
+    are flat indices, row times columns plus column; the path is empty when there is none.
+    """
+    rows, columns = free.shape
+    goal_row, goal_column = goal // columns, goal % columns
+    cost = np.full(rows * columns, np.inf)
+    parent = np.full(rows * columns, -1, np.int32)
+    closed = np.zeros(rows * columns, np.bool_)
+    # A cell enters the open heap at most once for each of its 8 neighbours, in practice far less often.
+    heap_costs = np.empty(rows * columns, np.float64)
+    heap_nodes = np.empty(rows * columns, np.int32)
+    cost[start] = 0.0
+    _push(heap_costs, heap_nodes, 0, 0.0, start)
+    size = 1
+    while size > 0:
+        node = _pop(heap_costs, heap_nodes, size)
+        size -= 1
+        if closed[node]:
+            continue
+        closed[node] = True
+        if node == goal:
+            break
+        if size + 8 > heap_costs.size:
+            heap_costs = np.concatenate((heap_costs, np.empty_like(heap_costs)))
+            heap_nodes = np.concatenate((heap_nodes, np.empty_like(heap_nodes)))
+        row, column = node // columns, node % columns
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(column - 1, 0), min(column + 2, columns)):
+                other = r * columns + c
+                if not free[r, c] or closed[other]:
+                    continue
+                step = _SQRT2 if r != row and c != column else 1.0
+                new_cost = cost[node] + step * 0.5 * (weight[row, column] + weight[r, c])
+                if new_cost < cost[other]:
+                    cost[other] = new_cost
+                    parent[other] = node
+                    dr, dc = abs(r - goal_row), abs(c - goal_column)
+                    heuristic = max(dr, dc) + (_SQRT2 - 1.0) * min(dr, dc)
+                    _push(heap_costs, heap_nodes, size, new_cost + heuristic, other)
+                    size += 1
+    length = 0
+    node = goal if closed[goal] else -1
+    while node >= 0:
+        length += 1
+        node = parent[node]
+    path = np.empty(length, np.int32)
+    node = goal
+    for i in range(length - 1, -1, -1):
+        path[i] = node
+        node = parent[node]
+    return path
+
+
+@numba.njit(cache=True)
+def _leg_cost(ax: float, ay: float, bx: float, by: float, weight: NDArray[np.float64], cell_m: float) -> float:
+    """Return the length of a straight leg times the mean weight under it, sampled twice a cell."""
+    rows, columns = weight.shape
+    length = math.hypot(bx - ax, by - ay)
+    count = int(2.0 * length / cell_m) + 1
+    total = 0.0
+    for i in range(count):
+        t = (i + 0.5) / count
+        row = min(max(int((ay + t * (by - ay)) / cell_m), 0), rows - 1)
+        column = min(max(int((ax + t * (bx - ax)) / cell_m), 0), columns - 1)
+        total += weight[row, column]
+    return length * total / count
+
+
+@numba.njit(cache=True)
+def pull_tight(
+    points: NDArray[np.float64],
+    boxes: NDArray[np.float64],
+    circles: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    first_clearance_m: float,
+    clearance_m: float,
+    cell_m: float,
+) -> NDArray[np.int64]:
+    """Return the indices of the corners left when a path is pulled tight, the last point included.
+
+    From each corner on, the next one is the farthest later point to which the straight leg keeps
+    ``clearance_m`` (``first_clearance_m`` on the first leg) and costs no more than the stretch of path that
+    it replaces. A corner's direct successor is always taken as seen. The first corner to see from is
+    ``points[0]``, which is not among the returned ones.
+    """
+    count = points.shape[0]
+    cost = np.zeros(count)
+    for i in range(1, count):
+        ax, ay = points[i - 1]
+        bx, by = points[i]
+        cost[i] = cost[i - 1] + _leg_cost(ax, ay, bx, by, weight, cell_m)
+    corners = np.empty(count, np.int64)
+    size = 0
+    at = 0
+    while at < count - 1:
+        need = first_clearance_m if at == 0 else clearance_m
+        ax, ay = points[at]
+        nxt = count - 1
+        while nxt > at + 1:
+            bx, by = points[nxt]
+            # Legs of equal cost differ by rounding.
+            allowed = (cost[nxt] - cost[at]) * (1.1)
+            if (
+                _leg_cost(ax, ay, bx, by, weight, cell_m) <= allowed
+                and segment_clearance(ax, ay, bx, by, boxes, circles, need) >= need
+            ):
+                break
+            nxt -= 1
+        corners[size] = nxt
+        size += 1
+        at = nxt
+    return corners[:size]

@@ -1,0 +1,333 @@
+"""The task: what the robot is told, what its actions mean and what it is paid, as pure functions.
+
+Everything here follows the paper's sections "States and Observations", "Actions" and "Reward"; nothing here
+holds state. Whoever steps the world calls these functions and keeps the state.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.world.lidar import MAX_RANGE_M
+
+# Actions (paper, section "Actions").
+MIN_LINEAR_VELOCITY = -0.2
+"""w_minv, m/s."""
+MAX_LINEAR_VELOCITY = 0.6
+"""w_maxv, m/s."""
+MAX_ANGULAR_VELOCITY = math.radians(90.0)
+"""w_maxomega, rad/s."""
+DEAD_BAND = math.radians(15.0)
+"""Desired angular velocities below this are taken as 0, rad/s."""
+MAX_LINEAR_ACCELERATION = 1.5
+"""w_accv, m/s^2."""
+MAX_ANGULAR_ACCELERATION = math.radians(120.0)
+"""w_accomega, rad/s^2."""
+MOTOR_PERIOD_S = 0.02
+"""Control period of the motor controller, Delta t."""
+
+# Observations (paper, section "States and Observations").
+MIN_RANGE_M = 0.01
+"""Ranges are seen strictly between this and the lidar's :data:`~rcdsac_trl.world.lidar.MAX_RANGE_M`."""
+RANGE_OFFSET = 2.5
+"""What is added to log10 of the distance, so that 0 can mean "nothing there"."""
+MAX_RANGE_OBSERVATION = RANGE_OFFSET + math.log10(MAX_RANGE_M)
+"""Upper limit of a range observation."""
+WAYPOINT_DISTANCE_LIMITS_M = (0.01, 100.0)
+
+# Reward (paper, section "Reward").
+BASE_REWARD = -0.02
+GOAL_REWARD = 10.0
+COLLISION_REWARD = -10.0
+MIN_WAYPOINT_REWARD = -0.1
+STRAIGHT_FACTOR = 1.2
+"""r_angular while the desired angular velocity is inside the dead band."""
+MIN_TURN_FACTOR = 0.5
+TURN_SCALE = math.radians(120.0)
+"""The desired angular velocity at which 1 - |omega_u| / scale would reach 0, rad/s."""
+
+# A bound given in degrees must hold for a float that went through radians: 15 deg/s itself is kept.
+_ANGULAR_TOLERANCE = 1e-6
+
+CollisionPenaltyMode = Literal["onset", "per_step"]
+"""When r_coll is paid: once as a contact begins, or in every agent step in contact."""
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """What the task leaves to choose; every field is a key of ``conf/task/*.yaml``.
+
+    Attributes:
+        episode_steps: agent steps in an episode.
+        collision_penalty_mode: ``"onset"`` pays -10 once, as a contact begins; ``"per_step"`` in every agent
+            step in contact.
+        waypoint_radius_m: a waypoint nearer than this gives way to the next.
+        goal_radius_m: a goal nearer than this is reached.
+        min_path_m: shortest path from where the robot is to a new goal.
+        motor_steps: numbers of 0.02 s motor steps in an agent step; an episode draws one of them.
+        range_noise_std_m: standard deviation of the noise on a range.
+        range_dropout: probability that a range is lost (reads as "nothing there"), per bin and step.
+        odometry_noise_std: standard deviations of the noise on the measured velocities, (m/s, rad/s).
+        action_delay_steps: agent steps an action waits before it acts.
+
+    Raises:
+        UserInputError: a value is outside its limits.
+
+    Example:
+        >>> TaskSettings().motor_steps
+        (6, 7, 8)
+    """
+
+    episode_steps: int = 1000
+    collision_penalty_mode: CollisionPenaltyMode = "onset"
+    waypoint_radius_m: float = 0.5
+    goal_radius_m: float = 0.15
+    min_path_m: float = 4.0
+    motor_steps: tuple[int, ...] = (6, 7, 8)
+    range_noise_std_m: float = 0.0
+    range_dropout: float = 0.0
+    odometry_noise_std: tuple[float, float] = (0.0, 0.0)
+    action_delay_steps: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what is outside the limits."""
+        # Hydra hands lists over; a frozen value keeps tuples.
+        object.__setattr__(self, "motor_steps", tuple(self.motor_steps))
+        object.__setattr__(self, "odometry_noise_std", tuple(self.odometry_noise_std))
+        if self.episode_steps < 1:
+            raise UserInputError(f"episode_steps={self.episode_steps} must be at least 1")
+        modes = get_args(CollisionPenaltyMode)
+        if self.collision_penalty_mode not in modes:
+            raise UserInputError(
+                f"collision_penalty_mode={self.collision_penalty_mode!r} does not exist; "
+                f"choose {' or '.join(modes)}"
+            )
+        for name in ("waypoint_radius_m", "goal_radius_m", "min_path_m"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise UserInputError(f"{name}={getattr(self, name)} must be a positive number of metres")
+        if not self.motor_steps or any(n != int(n) or n < 1 for n in self.motor_steps):
+            raise UserInputError(
+                f"motor_steps={list(self.motor_steps)} must be whole numbers of at least 1, such as [6, 7, 8]"
+            )
+        if not 0.0 <= self.range_noise_std_m < math.inf:
+            raise UserInputError(f"range_noise_std_m={self.range_noise_std_m} must be 0 or more")
+        if not 0.0 <= self.range_dropout <= 1.0:
+            raise UserInputError(f"range_dropout={self.range_dropout} is a probability; give 0 to 1")
+        if len(self.odometry_noise_std) != 2 or not all(0.0 <= s < math.inf for s in self.odometry_noise_std):
+            raise UserInputError(
+                f"odometry_noise_std={list(self.odometry_noise_std)} must be two numbers of 0 or more: "
+                "m/s and rad/s"
+            )
+        if self.action_delay_steps < 0:
+            raise UserInputError(f"action_delay_steps={self.action_delay_steps} must be 0 or more")
+
+
+def desired_velocities(action: ArrayLike) -> tuple[float, float]:
+    """Return the desired velocities (v_u, omega_u) of an action, m/s and rad/s.
+
+    The linear velocity runs from -0.2 to 0.6 m/s over u_0; the angular one is 90 deg/s times u_1, and 0 where
+    its size is below 15 deg/s.
+
+    Args:
+        action: u, [2], in [-1, 1]; what is outside is clipped.
+
+    Example:
+        >>> desired_velocities([1.0, 0.1])
+        (0.6, 0.0)
+    """
+    u0, u1 = (min(max(float(u), -1.0), 1.0) for u in np.asarray(action, dtype=np.float64))
+    linear = MIN_LINEAR_VELOCITY * (1.0 - u0) / 2.0 + MAX_LINEAR_VELOCITY * (1.0 + u0) / 2.0
+    angular = MAX_ANGULAR_VELOCITY * u1
+    return linear, 0.0 if _inside_dead_band(angular) else angular
+
+
+def _inside_dead_band(angular_velocity: float) -> bool:
+    """Return whether |omega| < 15 deg/s; exactly 15 deg/s is outside, float rounding or not."""
+    return abs(angular_velocity) < DEAD_BAND * (1.0 - _ANGULAR_TOLERANCE)
+
+
+def clip_command(
+    v_u: float, omega_u: float, v_c: float, omega_c: float, period_s: float = MOTOR_PERIOD_S
+) -> tuple[float, float]:
+    """Return the velocities the motor controller commands: the desired ones, within the acceleration limits.
+
+    Args:
+        v_u: desired linear velocity, m/s.
+        omega_u: desired angular velocity, rad/s.
+        v_c: current linear velocity, m/s.
+        omega_c: current angular velocity, rad/s.
+        period_s: control period of the motor controller.
+
+    Example:
+        >>> clip_command(0.6, 0.0, 0.0, 0.0)
+        (0.03, 0.0)
+    """
+    dv, domega = MAX_LINEAR_ACCELERATION * period_s, MAX_ANGULAR_ACCELERATION * period_s
+    return min(max(v_u, v_c - dv), v_c + dv), min(max(omega_u, omega_c - domega), omega_c + domega)
+
+
+def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float32]:
+    """Return o_rng: 2.5 + log10 of the distance, 0 where nothing is within (0.01, 3) m or the mask is false.
+
+    Args:
+        distances: [..., 180], m; ``inf`` where nothing is.
+        mask: bool [180], the bins the sensor has; see :func:`rcdsac_trl.world.lidar.sensor_mask`.
+
+    Returns:
+        float32 [..., 180].
+
+    Example:
+        >>> range_observation([1.0, 0.1, 3.0], [True, True, True]).tolist()
+        [2.5, 1.5, 0.0]
+    """
+    d = np.asarray(distances, dtype=np.float64)
+    seen = (d > MIN_RANGE_M) & (d < MAX_RANGE_M) & np.asarray(mask, dtype=np.bool_)
+    return np.where(seen, RANGE_OFFSET + np.log10(np.where(seen, d, 1.0)), 0.0).astype(np.float32)
+
+
+def waypoint_observation(
+    pose: tuple[float, float, float], waypoint_1: ArrayLike, waypoint_2: ArrayLike
+) -> NDArray[np.float32]:
+    """Return o_waypoint: log10 of the distance, cosine and sine of the bearing, of the next two waypoints.
+
+    Args:
+        pose: the robot's x, y in m and yaw in rad, map frame.
+        waypoint_1: [2], the next waypoint, map frame, m.
+        waypoint_2: [2], the one after it; on the last leg both are the goal.
+
+    Returns:
+        float32 [6]; distances are clipped to [0.01, 100] m before the logarithm.
+
+    Example:
+        >>> waypoint_observation((0.0, 0.0, 0.0), (10.0, 0.0), (0.0, 100.0)).round(6).tolist()
+        [1.0, 1.0, 0.0, 2.0, 0.0, 1.0]
+    """
+    values: list[float] = []
+    for waypoint in (waypoint_1, waypoint_2):
+        distance, bearing = distance_and_bearing(pose, waypoint)
+        low, high = WAYPOINT_DISTANCE_LIMITS_M
+        values += (math.log10(min(max(distance, low), high)), math.cos(bearing), math.sin(bearing))
+    return np.array(values, dtype=np.float32)
+
+
+def distance_and_bearing(pose: tuple[float, float, float], point: ArrayLike) -> tuple[float, float]:
+    """Return the distance to a point in m and its angle from the robot's x axis in rad, any full turns apart.
+
+    Args:
+        pose: the robot's x, y in m and yaw in rad, map frame.
+        point: [2], map frame, m.
+    """
+    x, y, yaw = pose
+    px, py = np.asarray(point, dtype=np.float64).tolist()
+    return math.hypot(px - x, py - y), math.atan2(py - y, px - x) - yaw
+
+
+def velocity_observation(v_c: float, omega_c: float, v_u: float, omega_u: float) -> NDArray[np.float32]:
+    """Return o_velocity, float32 [4]: measured velocities, then those desired by the previous action.
+
+    Args:
+        v_c: measured linear velocity, m/s.
+        omega_c: measured angular velocity, rad/s.
+        v_u: desired linear velocity, m/s.
+        omega_u: desired angular velocity after the dead band, rad/s.
+    """
+    return np.array([v_c, omega_c, v_u, omega_u], dtype=np.float32)
+
+
+def reward_components(
+    v_c: float, theta_1: float, omega_u: float, in_contact: bool, collided: bool, goal_reached: bool
+) -> NDArray[np.float32]:
+    """Return the five parts of the reward, float32 [5]: base, goal, waypoint, angular, collision.
+
+    Args:
+        v_c: linear velocity measured after the step, m/s.
+        theta_1: bearing, after the step, of the waypoint that was next during the step, rad.
+        omega_u: desired angular velocity after the dead band, rad/s.
+        in_contact: whether the robot touched anything during the step; r_waypoint is 0 then.
+        collided: whether r_coll is due; see :func:`collision_due`.
+        goal_reached: whether the goal was reached in this step.
+
+    Example:
+        >>> reward_components(0.5, 0.0, 0.0, False, False, False)
+        array([-0.02,  0.  ,  0.5 ,  1.2 ,  0.  ], dtype=float32)
+    """
+    waypoint = 0.0 if in_contact else max(MIN_WAYPOINT_REWARD, max(0.0, v_c) * math.cos(theta_1))
+    if _inside_dead_band(omega_u):
+        angular = STRAIGHT_FACTOR
+    else:
+        angular = max(MIN_TURN_FACTOR, 1.0 - abs(omega_u) / TURN_SCALE)
+    goal = GOAL_REWARD if goal_reached else 0.0
+    collision = COLLISION_REWARD if collided else 0.0
+    return np.array([BASE_REWARD, goal, waypoint, angular, collision], dtype=np.float32)
+
+
+def total_reward(
+    components: ArrayLike, collision_weight: float | NDArray[np.float32] = 1.0
+) -> NDArray[np.float32]:
+    """Return r = r_base + r_goal + r_waypoint * r_angular + w_coll * r_coll, float32 [...].
+
+    Args:
+        components: [..., 5], from :func:`reward_components`.
+        collision_weight: w_coll; 1 but for RCWR.
+
+    Example:
+        >>> float(total_reward([0.0, 10.0, 0.5, 0.5, -10.0], collision_weight=2.0))
+        -9.75
+    """
+    c = np.asarray(components, dtype=np.float32)
+    total = c[..., 0] + c[..., 1] + c[..., 2] * c[..., 3] + collision_weight * c[..., 4]
+    return np.asarray(total, dtype=np.float32)
+
+
+def collision_due(in_contact: bool, was_in_contact: bool, mode: CollisionPenaltyMode) -> bool:
+    """Return whether r_coll is paid in this agent step.
+
+    Args:
+        in_contact: contact in any motor step of this agent step.
+        was_in_contact: the same of the agent step before; False in an episode's first.
+        mode: ``"onset"`` pays the first step of a contact, ``"per_step"`` each.
+
+    Example:
+        >>> collision_due(True, True, "onset"), collision_due(True, True, "per_step")
+        (False, True)
+    """
+    return in_contact and (mode == "per_step" or not was_in_contact)
+
+
+def noisy_ranges(
+    distances: NDArray[np.float64], noise_std_m: float, dropout: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return the distances a noisy sensor reports; with both options at 0 they are returned as they are.
+
+    Args:
+        distances: [180], m; ``inf`` where nothing is, and there it stays.
+        noise_std_m: standard deviation of additive normal noise.
+        dropout: probability that a bin reports nothing (``inf``).
+        rng: the noise's own stream.
+    """
+    if noise_std_m > 0.0:
+        distances = distances + noise_std_m * rng.standard_normal(distances.shape)
+    if dropout > 0.0:
+        distances = np.where(rng.random(distances.shape) < dropout, np.inf, distances)
+    return distances
+
+
+def noisy_velocities(
+    v_c: float, omega_c: float, noise_std: tuple[float, float], rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return the velocities noisy odometry reports, m/s and rad/s; with both deviations at 0 as they are.
+
+    Args:
+        v_c: measured linear velocity, m/s.
+        omega_c: measured angular velocity, rad/s.
+        noise_std: standard deviations of additive normal noise, (m/s, rad/s).
+        rng: the noise's own stream.
+    """
+    if noise_std == (0.0, 0.0):
+        return v_c, omega_c
+    noise = rng.standard_normal(2)
+    return v_c + noise_std[0] * float(noise[0]), omega_c + noise_std[1] * float(noise[1])
