@@ -40,7 +40,7 @@ class _RangeFeatures(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, bins: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor
     ) -> Tensor:
         channels, taps = w1.shape[0], w1.shape[2]
@@ -69,7 +69,7 @@ class _RangeFeatures(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         bins, pair, third, padded, result, *saved = ctx.saved_tensors
         shape_1, shape_2, shape_3 = ctx.shapes
         channels, taps = shape_1[0], shape_1[2]
@@ -123,7 +123,7 @@ class _GatedValues(torch.autograd.Function):
     """``output(relu(hidden(x * gate)))`` with x broadcast over quantiles and the gate, where constant, over time."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, x: Tensor, gate: Tensor, weight: Tensor, bias: Tensor, out_weight: Tensor, out_bias: Tensor
     ) -> Tensor:
         number, (sequences, steps, size) = gate.shape[2], x.shape
@@ -142,7 +142,7 @@ class _GatedValues(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         x, gate, weight, out_weight, *saved = ctx.saved_tensors
         need_x, need_gate, need_weight = ctx.needs_input_grad[:3]
         d_x, d_gate = torch.empty_like(x), torch.empty_like(gate)

@@ -8,7 +8,7 @@ Public names::
         forward(batch [B, L+1]) -> loss_actor, loss_qvalue, loss_alpha, alpha, entropy, td_error, q_value
                                    (, quantile_spread)
         .make_value_estimator(gamma=0.99)   .set_keys(...)   .rng_state (get and set; also in state_dict)
-        .compute_target(batch, memories)  .qvalue_loss(batch, memories)  .actor_loss(batch, memories)
+        .encode_actor(batch), .compute_target(..), .qvalue_loss(..), .actor_loss(..): the parts of forward
         SoftUpdate(loss, eps=...) works; parameters: loss.actor_network_params, loss.critic_network_params,
         loss.log_alpha
     quantile_huber_loss(quantiles [..,N], targets [..,N'], tau [..,N], kappa=1) -> [..]
@@ -18,7 +18,7 @@ Public names::
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -34,7 +34,7 @@ from torchrl.objectives.utils import (
     distance_loss,
 )
 
-from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.agent.risk import Neutral, RiskMeasure
 
 
 def quantile_huber_loss(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
@@ -90,14 +90,6 @@ def squash(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     return raw.tanh(), log_prob.sum(-1)
 
 
-class Memories(NamedTuple):
-    """What one encoder pass over the L+1 observations of each network gives, each ``[B, L+1, memory]``."""
-
-    actor: Tensor
-    critics: tuple[Tensor, ...]
-    targets: tuple[Tensor, ...]
-
-
 class DistributionalSACLoss(LossModule):
     r"""Soft actor-critic whose critics are the quantile function of the return, or its mean.
 
@@ -106,8 +98,8 @@ class DistributionalSACLoss(LossModule):
 
     - critic: :func:`quantile_huber_loss` at fractions :math:`\tau_i, \tau'_j \sim U(0,1)` between
       :math:`\hat Z_{\tau_i}(s_t, a_t; \beta)` and
-      :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a_{t+1}; \beta) - \alpha \log\pi(a_{t+1}|s_{t+1},\beta))`,
-      the minimum being element-wise over the target critics, summed over the critics;
+      :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a; \beta) - \alpha \log\pi(a|s_{t+1},\beta))`,
+      with a policy action :math:`a` and the element-wise minimum over the target critics; summed over the critics;
     - actor: :math:`\alpha \log\pi - \min_k \frac1K \sum_j \hat Z^k_{\psi(\tau_j;\beta)}(s_t, a; \beta)`;
     - temperature: :math:`-\log\alpha \, (\log\pi + \bar H)`.
 
@@ -220,13 +212,14 @@ class DistributionalSACLoss(LossModule):
         self._distributional = self.tensor_keys.tau in critics[0][-1].in_keys
         if self._distributional and measure is None:
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
+        self._critics = tuple(critics)
 
         self.convert_to_functional(actor, "actor_network")
         # One functional module for all critics: their parameters keep apart (a list given to TorchRL's own
         # conversion is stacked, which a recurrent layer without vmap cannot use).
         self.convert_to_functional(nn.ModuleList(critics), "critic_network", create_target_params=True)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
-        self.measure = measure
+        self.measure = measure or Neutral()
         self.num_quantiles = num_quantiles
         self.num_target_quantiles = num_target_quantiles
         self.num_risk_samples = num_risk_samples
@@ -258,10 +251,10 @@ class DistributionalSACLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Every key the loss reads from a batch."""
         keys: dict[NestedKey, None] = dict.fromkeys(self.actor_network[0].in_keys)
-        for critic in self.critic_network:
+        for critic in self._critics:
             keys.update(dict.fromkeys(critic[0].in_keys))
         keys[self.tensor_keys.action] = None
-        if self.measure is not None:
+        if self._distributional:
             keys[self.tensor_keys.risk] = None
         for key in (self.tensor_keys.reward, self.tensor_keys.terminated):
             keys[("next", *key) if isinstance(key, tuple) else ("next", key)] = None
@@ -309,9 +302,9 @@ class DistributionalSACLoss(LossModule):
         nats, ``td_error`` the mean absolute pairwise temporal difference (largest over the critics), ``q_value`` the
         mean prediction and ``quantile_spread`` the standard deviation over a prediction's sampled quantiles.
         """
-        memories = self.encode(tensordict)
-        loss_qvalue, diagnostics = self.qvalue_loss(tensordict, memories)
-        loss_actor, log_prob = self.actor_loss(tensordict, memories)
+        actor_memory = self.encode_actor(tensordict)
+        loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory)
+        loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories)
         loss_alpha = -self.log_alpha * (log_prob + self.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha}
         diagnostics |= {"alpha": self.alpha, "entropy": -log_prob}
@@ -321,8 +314,8 @@ class DistributionalSACLoss(LossModule):
         losses = {key: _reduce(value, self.reduction) for key, value in losses.items()}
         return TensorDict(losses | {key: value.mean() for key, value in diagnostics.items()})
 
-    def encode(self, tensordict: TensorDictBase) -> Memories:
-        """Run every encoder once over the whole sequences.
+    def encode_actor(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the actor's memory of every observation, ``[B, L + 1 - burn_in, memory]``.
 
         Raises:
             ValueError: if the batch is not ``[B, L+1]`` with ``L`` above the burn-in.
@@ -333,27 +326,19 @@ class DistributionalSACLoss(LossModule):
                 f"got {list(tensordict.shape)}"
             )
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            actor = self._memory(self.actor_network, tensordict)
-        with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
-            critics = tuple(self._memory(critic, tensordict) for critic in self.critic_network)
-        with (
-            torch.no_grad(),
-            self.target_critic_network_params.to_module(self.critic_network, preserve_module_state=False),
-        ):
-            targets = tuple(self._memory(critic, tensordict) for critic in self.critic_network)
-        return Memories(actor, critics, targets)
+            return self._encode(self.actor_network, tensordict)
 
-    def compute_target(self, tensordict: TensorDictBase, memories: Memories) -> Tensor:
+    def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor) -> Tensor:
         """Return the target samples ``[B, L - burn_in, N']`` (scalar critics: N' = 1), without gradient."""
         batch, risk = self._transitions(tensordict), self._risk(tensordict)
         with torch.no_grad():
-            action, log_prob = self._act(memories.actor[:, 1:], risk)
+            action, log_prob = self._act(actor_memory[:, 1:], risk)
             tau = self._fractions(self.num_target_quantiles, log_prob)
             with self.target_critic_network_params.to_module(self.critic_network, preserve_module_state=False):
-                values = [
-                    self._evaluate(critic, memory[:, 1:], action, tau, risk)
-                    for critic, memory in zip(self.critic_network, memories.targets, strict=True)
-                ]
+                values = []
+                for critic in self._critics:
+                    memory = self._encode(critic, tensordict)[:, 1:]
+                    values.append(self._evaluate(critic, memory, action, tau, risk))
             next_value = _minimum(values) - self.alpha * log_prob.unsqueeze(-1)
             # The estimator checks shapes strictly, so every target fraction gets its own entry.
             outcome = TensorDict(batch_size=batch.batch_size)
@@ -364,38 +349,47 @@ class DistributionalSACLoss(LossModule):
             outcome.set(("next", keys.done), terminated)
             return self.value_estimator.value_estimate(outcome, next_value=next_value)
 
-    def qvalue_loss(self, tensordict: TensorDictBase, memories: Memories) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the critic loss ``[B, L - burn_in]``, summed over the critics, and detached diagnostics."""
-        target = self.compute_target(tensordict, memories)
+    def qvalue_loss(
+        self, tensordict: TensorDictBase, actor_memory: Tensor
+    ) -> tuple[Tensor, list[Tensor], dict[str, Tensor]]:
+        """Return the critic loss, the critics' memories for :meth:`actor_loss`, and detached diagnostics.
+
+        The loss ``[B, L - burn_in]`` is summed over the critics; a memory is ``[B, L - burn_in, memory]``.
+        """
+        target = self.compute_target(tensordict, actor_memory)
         action, risk = self._transitions(tensordict).get(self.tensor_keys.action), self._risk(tensordict)
         tau = self._fractions(self.num_quantiles, action)
         with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
+            # No transition starts at the last observation.
+            memories = [self._encode(critic, tensordict[:, :-1]) for critic in self._critics]
             values = [
-                self._evaluate(critic, memory[:, :-1], action, tau, risk)
-                for critic, memory in zip(self.critic_network, memories.critics, strict=True)
+                self._evaluate(critic, memory, action, tau, risk)
+                for critic, memory in zip(self._critics, memories, strict=True)
             ]
-        if self._distributional:
-            errors = [quantile_huber_loss(value, target, tau, self.kappa) for value in values]
-        else:
+        if tau is None:
             errors = [distance_loss(value, target, self.loss_function).squeeze(-1) for value in values]
-        return torch.stack(errors).sum(0), self._diagnose(values, target)
+        else:
+            errors = [quantile_huber_loss(value, target, tau, self.kappa) for value in values]
+        return torch.stack(errors).sum(0), memories, self._diagnose(values, target)
 
-    def actor_loss(self, tensordict: TensorDictBase, memories: Memories) -> tuple[Tensor, Tensor]:
+    def actor_loss(
+        self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor]
+    ) -> tuple[Tensor, Tensor]:
         """Return the actor loss and the detached log density of its action, both ``[B, L - burn_in]``."""
         risk = self._risk(tensordict)
-        action, log_prob = self._act(memories.actor[:, :-1], risk)
+        action, log_prob = self._act(actor_memory[:, :-1], risk)
         tau = self._fractions(self.num_risk_samples, log_prob)
-        if tau is not None:
+        if tau is not None and risk is not None:
             tau = self.measure.psi(tau, risk)
         with self._cached_detached_critic_params.to_module(self.critic_network, preserve_module_state=False):
             values = [
-                self._evaluate(critic, memory[:, :-1].detach(), action, tau, risk).mean(-1)
-                for critic, memory in zip(self.critic_network, memories.critics, strict=True)
+                self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
+                for critic, memory in zip(self._critics, critic_memories, strict=True)
             ]
         return self.alpha * log_prob - _minimum(values), log_prob.detach()
 
     # ------------------------------------------------------------------------------------------- parts of them
-    def _memory(self, network: TensorDictSequential, tensordict: TensorDictBase) -> Tensor:
+    def _encode(self, network: TensorDictSequential, tensordict: TensorDictBase) -> Tensor:
         encoder = network[0]
         memory = encoder(tensordict.select(*encoder.in_keys)).get(encoder.out_keys[0])
         return memory[:, self.burn_in :]
@@ -404,8 +398,8 @@ class DistributionalSACLoss(LossModule):
         return tensordict[:, self.burn_in : -1]
 
     def _risk(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Return beta per transition, with a time dimension of 1 where it is constant along every sequence."""
-        if self.measure is None:
+        """Return beta per transition (a time dimension of 1 where it is constant); None for scalar critics."""
+        if not self._distributional:
             return None
         risk = tensordict.get(self.tensor_keys.risk)[:, self.burn_in : -1]
         first = risk[:, :1]

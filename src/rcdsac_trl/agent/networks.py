@@ -165,8 +165,8 @@ class CosineFeatures(nn.Module):
 class ActorHead(nn.Module):
     r"""Memory (and ``beta``) to the mean and the standard deviation of the pre-tanh action.
 
-    :math:`g^{actor}(o_{0:t}) \odot g^{actorRisk}(\phi^\beta)`, a linear layer, then the two outputs. Without a measure there is
-    no gate: the policy of SAC, RCWR and DSAC.
+    :math:`g^{actor}(o_{0:t}) \odot g^{actorRisk}(\phi^\beta)`, a linear layer, then the two outputs. Without a
+    measure there is no gate: the policy of SAC, RCWR and DSAC.
 
     Args:
         action_size: number of action dimensions.

@@ -39,11 +39,13 @@ class Interval:
     high_inclusive: bool = True
 
     def __contains__(self, value: float) -> bool:
+        """Tell whether the value lies inside."""
         above = value >= self.low if self.low_inclusive else value > self.low
         below = value <= self.high if self.high_inclusive else value < self.high
         return above and below
 
     def __str__(self) -> str:
+        """Write the interval with its brackets."""
         opening, closing = "[" if self.low_inclusive else "(", "]" if self.high_inclusive else ")"
         return f"{opening}{self.low:g}, {self.high:g}{closing}"
 
@@ -90,12 +92,13 @@ class RiskMeasure(ABC):
         """Return the distorted fractions; ``tau`` in [0, 1] and ``beta`` broadcast against each other."""
 
     def weight(self, u: Tensor, beta: Tensor) -> Tensor:
-        r"""Return the dual density :math:`g'(u)` with :math:`g = \psi^{-1}`, so that the value is
-        :math:`\int_0^1 g'(u)\, Z_u\, du`.
+        r"""Return the dual density at the fraction ``u``.
+
+        It is :math:`g'(u)` with :math:`g = \psi^{-1}`, so that the value is :math:`\int_0^1 g'(u)\, Z_u\, du`.
 
         Raises:
             NotImplementedError: where the measure has no closed-form density.
-        """  # noqa: D205
+        """
         raise NotImplementedError(f"{type(self).__name__} has no closed-form dual density")
 
     def embed(self, beta: Scalar) -> Scalar:

@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.paths import CONF_DIR
-from rcdsac_trl.pipeline.runtime import keep_pages
+from rcdsac_trl.pipeline.runtime import keep_pages, quiet_libraries
 
 Task = Callable[[DictConfig], None]
 
@@ -42,6 +42,7 @@ def entry_point(config_name: str, *, check: Task) -> Callable[[Task], Callable[[
 
         def main() -> None:
             keep_pages()
+            quiet_libraries()
             try:
                 precheck(config_name, sys.argv[1:], check)
             except UserInputError as error:

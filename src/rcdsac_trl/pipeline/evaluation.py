@@ -115,7 +115,11 @@ class EvaluationRun:
     def run(self) -> None:
         """Drive, write, and print the summary."""
         with tqdm(total=self.num_maps, unit="map", disable=None) as bar:
-            episodes = self.rows(lambda done: bar.update(done - bar.n))
+
+            def show(maps_done: int) -> None:
+                bar.update(maps_done - bar.n)
+
+            episodes = self.rows(show)
         summary = summarise(episodes, ["beta", "collision_weight"])
         self.out.mkdir(parents=True, exist_ok=True)
         episodes.to_csv(self.out / "episodes.csv", index=False, float_format="%.9g")

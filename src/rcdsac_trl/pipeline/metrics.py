@@ -73,7 +73,7 @@ def summarise(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
         by: columns that make a group; missing values form groups of their own.
     """
     groups = episodes.groupby(by, dropna=False, sort=False)
-    parts = {"episodes": groups.size()}
+    parts: dict[str, pd.Series] = {"episodes": groups.size()}
     for metric in METRICS:
         parts[f"{metric}_mean"] = groups[metric].mean()
         parts[f"{metric}_std"] = groups[metric].std(ddof=0)

@@ -3,9 +3,13 @@
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.world.pursuit import pursuit_action
+
+# Autocorrelation of the warm-up's noise from one agent step (about 0.14 s) to the next: it lasts some 10 steps.
+PERSISTENCE = 0.9
 
 
 class PursuitPolicy(TensorDictModuleBase):
@@ -22,15 +26,16 @@ class PursuitPolicy(TensorDictModuleBase):
 class CollectionPolicy(TensorDictModuleBase):
     """The agent's policy, preceded by some iterations of noisy pursuit.
 
-    Random actions press the robot against walls most of the time; a noisy pursuit controller shows the critics
-    driving, turning, goals and collisions from the first update.
+    Random actions press the robot against walls most of the time. A pursuit controller under noise that keeps its
+    sign for a second or two shows the critics driving, turning, backing out, goals and collisions from the first
+    update.
 
     Args:
         policy: the agent's policy.
         generator: source of all exploration noise, seeded anew for each iteration.
         seed: root seed; iteration i uses the stream ``("exploration", i)``.
         pursuit_iterations: first iterations driven by pursuit.
-        pursuit_noise: standard deviation of the noise on its actions.
+        pursuit_noise: standard deviation of the noise on its actions, a first-order autoregressive process.
     """
 
     def __init__(
@@ -51,6 +56,7 @@ class CollectionPolicy(TensorDictModuleBase):
         self.pursuit_iterations = pursuit_iterations
         self.pursuit_noise = pursuit_noise
         self._pursuing = False
+        self._noise = torch.zeros(())
 
     def set_iteration(self, iteration: int) -> None:
         """Choose the driver and the noise of an iteration."""
@@ -62,9 +68,15 @@ class CollectionPolicy(TensorDictModuleBase):
         tensordict = self.policy(tensordict)
         if self._pursuing:
             action = pursuit_action(tensordict["waypoint"])
-            noise = torch.empty_like(action).normal_(generator=self.generator)
+            noise = self._next_noise(action, tensordict["is_init"])
             tensordict["action"] = (action + self.pursuit_noise * noise).clamp(-1.0, 1.0)
         return tensordict
+
+    def _next_noise(self, action: Tensor, is_init: Tensor) -> Tensor:
+        fresh = torch.empty(action.shape, device=self.generator.device).normal_(generator=self.generator)
+        kept = PERSISTENCE * self._noise + (1 - PERSISTENCE**2) ** 0.5 * fresh
+        self._noise = torch.where(is_init, fresh, kept)
+        return self._noise
 
 
 class OnDevice(TensorDictModuleBase):

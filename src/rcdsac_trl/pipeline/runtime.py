@@ -29,6 +29,11 @@ def keep_pages() -> None:
     os.execve(sys.executable, sys.orig_argv, os.environ | _GLIBC_KEEPS_PAGES)
 
 
+def quiet_libraries() -> None:
+    """Keep TorchRL's own notes (every storage it makes) out of the user's log, unless they ask for them."""
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+
 def allocator() -> str:
     """Name the allocator's state for the log."""
     if "LD_PRELOAD" in os.environ:

@@ -6,6 +6,10 @@ from typing import Literal, get_args
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.metrics import Condition, check_unique
+from rcdsac_trl.world.env import resolve_num_workers
+from rcdsac_trl.world.lidar import SENSORS
+from rcdsac_trl.world.maps import MapSettings
+from rcdsac_trl.world.task import TaskSettings
 
 Critic = Literal["quantile", "scalar"]
 Conditioning = Literal["per_episode", "fixed", "none"]
@@ -149,6 +153,25 @@ class AlgoSettings:
             asked = self.default_conditions
         check_unique(asked)
         return asked
+
+
+@dataclass(frozen=True)
+class WorldSettings:
+    """What an environment is made of."""
+
+    map_settings: MapSettings
+    task: TaskSettings
+    sensor: str
+    num_agents: int
+    num_workers: int | Literal["auto"]
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown sensor and agents that the workers cannot share."""
+        if self.sensor not in SENSORS:
+            raise UserInputError(f"sensor.name={self.sensor} is unknown: choose one of {', '.join(SENSORS)}")
+        if self.num_agents < 1:
+            raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
+        resolve_num_workers(self.num_workers, self.num_agents)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The training loop: a new map and its episodes, then updates; look at the agent, save it, say how it goes."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,7 +28,7 @@ class Learner:
     Args:
         replay: gives batches of sequences.
         loss: returns ``loss_qvalue``, ``loss_actor``, ``loss_alpha`` with isolated gradients, and diagnostics.
-        relabel: sets the `risk` of a batch for a given fraction of beta's range.
+        relabel: sets the `risk` of a batch for a given fraction of beta's range; None: the loss reads none.
         optimizer: holds the parameters of all three losses.
         targets: moves the target critics.
         clipped: groups of parameters whose gradient norm is clipped together, and the limit; None: no clipping.
@@ -38,7 +39,7 @@ class Learner:
         *,
         replay: SequenceReplay,
         loss: LossModule,
-        relabel: Callable[[TensorDictBase, float], TensorDictBase],
+        relabel: Callable[[TensorDictBase, float], TensorDictBase] | None,
         optimizer: torch.optim.Optimizer,
         targets: SoftUpdate,
         clipped: list[list[nn.Parameter]],
@@ -54,7 +55,9 @@ class Learner:
 
     def update(self, range_fraction: float) -> dict[str, Tensor]:
         """Do one update and return the losses and diagnostics, detached and still on the device."""
-        batch = self.relabel(self.replay.sample(), range_fraction)
+        batch: TensorDictBase = self.replay.sample()
+        if self.relabel is not None:
+            batch = self.relabel(batch, range_fraction)
         losses = self.loss(batch)
         # One backward pass serves all three: the loss isolates their gradients.
         torch.stack([losses[key] for key in LOSS_KEYS]).sum().backward()
@@ -194,8 +197,8 @@ class Trainer:
             self.best_score = score
             self._save(iteration, best=True)
         record = {"validation/score": score}
-        for (beta, weight), values in by_condition.iterrows():
-            label = next((f"{x:g}" for x in (beta, weight) if x == x), "all")
+        for values in by_condition.reset_index().to_dict("records"):
+            label = next((f"{values[key]:g}" for key in conditions if not math.isnan(values[key])), "all")
             record |= {f"validation/{metric}/{label}": float(values[metric]) for metric in METRICS}
         return record
 

@@ -11,11 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.world.geometry import CELL_M, keeps_connected, lower_clearance, segment_clearance
-from rcdsac_trl.world.shapes import Box, Cylinder
-
-DETOUR_M = 1.5
-"""How far around an unmapped piece a way past it may lead, m."""
+from rcdsac_trl.world.geometry import CELL_M, lower_clearance, segment_clearance
+from rcdsac_trl.world.search import keeps_connected
+from rcdsac_trl.world.shapes import Box, Cylinder, solid_arrays
 
 _GAP_M = 0.02  # between pieces, so that no two solids overlap
 _TRIES = 20  # pieces drawn before a place is left empty
@@ -25,25 +23,26 @@ _GROUP_M = 0.9  # standard deviation of how far from them
 _WEIGHTS = {True: (0.3, 0.35, 0.15, 0.2), False: (0.1, 0.4, 0.25, 0.25)}
 
 Piece = Box | Cylinder
-_Arrays = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class ClutterSite:
     """A building and the pieces that have been put into it so far."""
 
-    def __init__(self, walls: list[Box], size_m: float, clearance_m: float) -> None:
+    def __init__(self, walls: list[Box], size_m: float, clearance_m: float, detour_m: float) -> None:
         """Begin with the empty building.
 
         Args:
             walls: the building.
             size_m: side of the square map, m.
             clearance_m: robot radius plus margin, m.
+            detour_m: how far around the places that an unmapped piece takes a way past it may lead, m.
         """
         self.pieces: list[Piece] = []
         self._walls = walls
         self._size_m = size_m
         self._clearance_m = clearance_m
-        self._boxes, self._circles = _arrays(walls)
+        self._detour_m = detour_m
+        self._boxes, self._circles = solid_arrays(walls)
         side = round(size_m / CELL_M)
         self._field = np.full((side, side), np.inf)
         lower_clearance(self._field, self._boxes, self._circles, clearance_m, CELL_M)
@@ -62,16 +61,18 @@ class ClutterSite:
 
     def _put(self, piece: Piece) -> bool:
         """Put a piece in unless it overlaps something or cuts the free space."""
-        if self._overlaps(piece):
+        inside = all(0.0 < centre < self._size_m for centre in (piece.x, piece.y))
+        if not inside or self._overlaps(piece):
             return False
-        boxes, circles = _arrays([piece])
-        near_m = _bounding_radius(piece) + self._clearance_m + (0.0 if piece.mapped else DETOUR_M)
+        boxes, circles = solid_arrays([piece])
+        near_m = _bounding_radius(piece) + self._clearance_m + (0.0 if piece.mapped else self._detour_m)
         window = self._window(piece, near_m + 2 * CELL_M)
         field = self._field.copy()
         lower_clearance(field, boxes, circles, self._clearance_m, CELL_M)
         before, after = self.free, field >= self._clearance_m
         # A way past the piece nearby is enough; only a mapped piece may also rely on one far away.
-        if not keeps_connected(before[window], after[window]) and not (piece.mapped and keeps_connected(before, after)):
+        passable = keeps_connected(before[window], after[window])
+        if not passable and not (piece.mapped and keeps_connected(before, after)):
             return False
         self._field = field
         self._boxes = np.concatenate([self._boxes, boxes])
@@ -130,12 +131,6 @@ def _shelf(walls: list[Box], mapped: bool, rng: np.random.Generator) -> Box:
     if wall.half_x > wall.half_y:
         return Box(wall.x + shift, wall.y + offset, along, deep, 0.0, mapped)
     return Box(wall.x + offset, wall.y + shift, deep, along, 0.0, mapped)
-
-
-def _arrays(pieces: list[Box] | list[Piece]) -> _Arrays:
-    boxes = [(p.x, p.y, p.half_x, p.half_y, math.cos(p.yaw), math.sin(p.yaw)) for p in pieces if isinstance(p, Box)]
-    circles = [(p.x, p.y, p.radius) for p in pieces if isinstance(p, Cylinder)]
-    return np.array(boxes, np.float64).reshape(-1, 6), np.array(circles, np.float64).reshape(-1, 3)
 
 
 def _bounding_radius(piece: Piece) -> float:

@@ -1,5 +1,6 @@
 """The navigation task as a TorchRL environment, in one process or over several workers."""
 
+import multiprocessing
 import os
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -18,7 +19,9 @@ from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES, Space
 from rcdsac_trl.world.task import TaskSettings
 
 COLLISION_WEIGHT = "collision_weight"
-_START_METHOD = "spawn"
+# A worker made by "fork" inherits the learner's threads and locks in whatever state they are, one made by "spawn"
+# imports everything anew, which takes seconds. A fork server is a clean process that has imported it all once.
+_START_METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
 class NavigationEnv(EnvBase):
@@ -42,7 +45,8 @@ class NavigationEnv(EnvBase):
         sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
         split: which of the disjoint map sets.
         seed: root seed of maps, starts, goals, movers and noise.
-        agent_ids: global numbers of the agents held here; the batch size is their number.
+        agent_ids: global numbers of the n agents held here, batch size [n]; agents with equal numbers meet the
+            same starts, goals and movers.
         first_episode: number of the first episode, also after :meth:`set_seed`.
         weighted_collisions: read ``collision_weight`` [1] from the input and scale the collision reward by
             it; ``reward_components`` stay unscaled. It is an observation too: 1, or what a reset brings.
@@ -165,6 +169,23 @@ class NavigationEnv(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
 
+class _Workers(ParallelEnv):
+    """A ``ParallelEnv`` that leaves this process's number of threads alone.
+
+    The original takes a thread a worker from this process as long as the workers live, and when it closes sets the
+    number that the process had when TorchRL was imported. Here workers rest while the learner computes.
+    """
+
+    def _start_workers(self) -> None:
+        self.num_threads = torch.get_num_threads()
+        super()._start_workers()
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        threads = torch.get_num_threads()
+        super().close(raise_if_closed=raise_if_closed)
+        torch.set_num_threads(threads)
+
+
 def _torch_spec(space: Space, batch: torch.Size) -> TensorSpec:
     shape = torch.Size([*batch, space.size])
     if space.dtype is np.bool_:
@@ -210,11 +231,10 @@ def make_env(
         sensor: sensor setting.
         split: map set.
         seed: root seed.
-        agent_ids: global numbers of the agents; agents of equal number meet the same maps, starts and goals.
-        num_workers: 0 makes one environment of batch [agents] in this process. W >= 1 makes a
-            ``ParallelEnv`` of W processes with agents / W agents each, batch [W, agents / W], agents
-            in order when flattened. ``"auto"`` takes the largest divisor of the number of agents that is not above the
-            number of cores this process may use.
+        agent_ids: global numbers of the n agents, in the order of the flattened batch.
+        num_workers: 0 makes one environment of batch [n] in this process; W >= 1 a ``ParallelEnv`` of W
+            processes with n / W agents each, batch [W, n / W]; ``"auto"`` takes for W the largest divisor of n
+            that is not above the number of cores this process may use.
         first_episode: number of the first episode.
         weighted_collisions: whether the environment reads ``collision_weight``.
         serial: put the W environments into a ``SerialEnv`` in this process instead (for tests and debugging).
@@ -243,10 +263,8 @@ def make_env(
     if workers == 0:
         return NavigationEnv(**shared, agent_ids=ids, gui=gui)
     share = len(ids) // workers
-    kwargs = [
-        {**shared, "agent_ids": ids[w * share : (w + 1) * share], "gui": gui and w == 0}
-        for w in range(workers)
-    ]
+    kwargs = [{**shared, "agent_ids": ids[w * share : (w + 1) * share], "gui": gui and w == 0} for w in range(workers)]
     if serial:
         return SerialEnv(workers, NavigationEnv, create_env_kwargs=kwargs)
-    return ParallelEnv(workers, NavigationEnv, create_env_kwargs=kwargs, mp_start_method=_START_METHOD)
+    multiprocessing.set_forkserver_preload([__name__])
+    return _Workers(workers, NavigationEnv, create_env_kwargs=kwargs, mp_start_method=_START_METHOD)

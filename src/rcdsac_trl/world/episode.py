@@ -107,10 +107,10 @@ class NavigationAgent:
 
     def step(self, action: Sequence[float]) -> NDArray[np.float32]:
         """Take one agent step and return the reward's components, float32 [5]."""
-        task = self._task
+        simulation, task = self._require_simulation(), self._task
         v_u, omega_u = rules.desired_velocities(action)
         self._delayed.append((v_u, omega_u))
-        moved = self._require_simulation().step(*self._delayed.popleft(), self._motor_steps)
+        moved = simulation.step(*self._delayed.popleft(), self._motor_steps)
         collided = rules.collision_due(moved.in_contact, self.in_contact, task.collision_penalty_mode)
         self.in_contact = moved.in_contact
         self.pose = moved.pose
@@ -200,7 +200,7 @@ class AgentGroup:
         sensor: one of :data:`rcdsac_trl.world.lidar.SENSORS`.
         split: which of the disjoint map sets.
         seed: root seed, at least 0.
-        agent_ids: the agents' global numbers, different and at least 0.
+        agent_ids: the agents' global numbers, at least 0; agents with equal numbers meet the same episodes.
         first_episode: number of each agent's first episode, at least 0.
         gui: show PyBullet's window for the first agent.
 

@@ -1,4 +1,4 @@
-"""Compiled plane geometry and grid search, shared by the map generator and the planner.
+"""Compiled plane geometry, shared by the map generator and the planner.
 
 Shapes come as ``boxes`` float64 [n, 6] (x, y, half_x, half_y, cos yaw, sin yaw) and ``circles`` float64
 [m, 3] (x, y, radius). Cell ``[row, column]`` of a grid has its centre at ``((column + 0.5) * cell_m,
@@ -9,8 +9,8 @@ point between them is at least sqrt(d^2 - L^2 / 4) from it (Stewart's theorem); 
 that bound for the longest leg of a grid, the diagonal. So a leg between neighbouring free cells, diagonal
 or not, never comes nearer than that to anything, whatever lies between the cells' centres.
 
-Everything that is compiled stays in this one file: Numba's cache notices a change of the file that holds
-a function, not of the files that function calls into.
+What is compiled calls nothing compiled in another file: Numba's cache notices a change of the file that
+holds a function, not of the files it calls into.
 """
 
 import math
@@ -25,7 +25,7 @@ CELL_M = 0.1
 ROBOT_RADIUS_M = 0.25
 """Circumradius of the octagonal robot, m."""
 
-_SQRT2 = math.sqrt(2.0)
+_SLACK = 1.03  # a little cost is given for fewer corners, else many lie a step or two apart
 
 
 def leg_clearance_m(clearance_m: float, cell_m: float = CELL_M) -> float:
@@ -145,157 +145,6 @@ def lower_clearance(
 
 
 @numba.njit(cache=True)
-def nearest_cell(free: NDArray[np.bool_], x: float, y: float, cell_m: float) -> int:
-    """Return the flat index of the free cell whose centre is nearest to a point, -1 when none is free."""
-    rows, columns = free.shape
-    best, nearest = np.inf, -1
-    for row in range(rows):
-        dy = (row + 0.5) * cell_m - y
-        for column in range(columns):
-            dx = (column + 0.5) * cell_m - x
-            if free[row, column] and dx * dx + dy * dy < best:
-                best = dx * dx + dy * dy
-                nearest = row * columns + column
-    return nearest
-
-
-@numba.njit(cache=True)
-def label_components(free: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
-    """Number the 8-connected components of the free cells 1, 2, ...; 0 is what is not free."""
-    rows, columns = free.shape
-    labels = np.zeros((rows, columns), np.int32)
-    stack = np.empty(rows * columns, np.int32)
-    count = 0
-    for seed in range(rows * columns):
-        if not free[seed // columns, seed % columns] or labels[seed // columns, seed % columns] > 0:
-            continue
-        count += 1
-        labels[seed // columns, seed % columns] = count
-        stack[0] = seed
-        size = 1
-        while size > 0:
-            size -= 1
-            row, column = stack[size] // columns, stack[size] % columns
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(column - 1, 0), min(column + 2, columns)):
-                    if free[r, c] and labels[r, c] == 0:
-                        labels[r, c] = count
-                        stack[size] = r * columns + c
-                        size += 1
-    return labels, count
-
-
-@numba.njit(cache=True)
-def keeps_connected(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> bool:
-    """Tell whether the cells free in both that are connected in ``before`` still are in ``after``."""
-    old, num_old = label_components(before)
-    new, _ = label_components(after)
-    heir = np.zeros(num_old + 1, np.int32)
-    for row in range(before.shape[0]):
-        for column in range(before.shape[1]):
-            if before[row, column] and after[row, column]:
-                label = old[row, column]
-                if heir[label] == 0:
-                    heir[label] = new[row, column]
-                elif heir[label] != new[row, column]:
-                    return False
-    return True
-
-
-@numba.njit(cache=True)
-def _push(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int, cost: float, node: int) -> None:
-    """Add an entry to a binary heap of ``size`` entries; ties go to the smaller node, so order is fixed."""
-    i = size
-    while i > 0:
-        parent = (i - 1) >> 1
-        if costs[parent] < cost or (costs[parent] == cost and nodes[parent] <= node):
-            break
-        costs[i], nodes[i] = costs[parent], nodes[parent]
-        i = parent
-    costs[i], nodes[i] = cost, node
-
-
-@numba.njit(cache=True)
-def _pop(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int) -> int:
-    """Remove the least entry of a binary heap of ``size`` entries and return its node."""
-    least = nodes[0]
-    cost, node = costs[size - 1], nodes[size - 1]
-    i = 0
-    while True:
-        child = 2 * i + 1
-        if child >= size - 1:
-            break
-        right = child + 1
-        if right < size - 1 and (
-            costs[right] < costs[child] or (costs[right] == costs[child] and nodes[right] < nodes[child])
-        ):
-            child = right
-        if cost < costs[child] or (cost == costs[child] and node <= nodes[child]):
-            break
-        costs[i], nodes[i] = costs[child], nodes[child]
-        i = child
-    costs[i], nodes[i] = cost, node
-    return least
-
-
-@numba.njit(cache=True)
-def cheapest_path(free: NDArray[np.bool_], weight: NDArray[np.float64], start: int, goal: int) -> NDArray[np.int32]:
-    """Return the cheapest 8-connected path over free cells by A*, both ends included.
-
-    A step costs its length in cells times the mean weight of its two cells; no weight is below 1. Cells
-    are flat indices, row times columns plus column; the path is empty when there is none.
-    """
-    rows, columns = free.shape
-    goal_row, goal_column = goal // columns, goal % columns
-    cost = np.full(rows * columns, np.inf)
-    parent = np.full(rows * columns, -1, np.int32)
-    closed = np.zeros(rows * columns, np.bool_)
-    # A cell enters the open heap at most once for each of its 8 neighbours, in practice far less often.
-    heap_costs = np.empty(rows * columns, np.float64)
-    heap_nodes = np.empty(rows * columns, np.int32)
-    cost[start] = 0.0
-    _push(heap_costs, heap_nodes, 0, 0.0, start)
-    size = 1
-    while size > 0:
-        node = _pop(heap_costs, heap_nodes, size)
-        size -= 1
-        if closed[node]:
-            continue
-        closed[node] = True
-        if node == goal:
-            break
-        if size + 8 > heap_costs.size:
-            heap_costs = np.concatenate((heap_costs, np.empty_like(heap_costs)))
-            heap_nodes = np.concatenate((heap_nodes, np.empty_like(heap_nodes)))
-        row, column = node // columns, node % columns
-        for r in range(max(row - 1, 0), min(row + 2, rows)):
-            for c in range(max(column - 1, 0), min(column + 2, columns)):
-                other = r * columns + c
-                if not free[r, c] or closed[other]:
-                    continue
-                step = _SQRT2 if r != row and c != column else 1.0
-                new_cost = cost[node] + step * 0.5 * (weight[row, column] + weight[r, c])
-                if new_cost < cost[other]:
-                    cost[other] = new_cost
-                    parent[other] = node
-                    dr, dc = abs(r - goal_row), abs(c - goal_column)
-                    heuristic = max(dr, dc) + (_SQRT2 - 1.0) * min(dr, dc)
-                    _push(heap_costs, heap_nodes, size, new_cost + heuristic, other)
-                    size += 1
-    length = 0
-    node = goal if closed[goal] else -1
-    while node >= 0:
-        length += 1
-        node = parent[node]
-    path = np.empty(length, np.int32)
-    node = goal
-    for i in range(length - 1, -1, -1):
-        path[i] = node
-        node = parent[node]
-    return path
-
-
-@numba.njit(cache=True)
 def _leg_cost(ax: float, ay: float, bx: float, by: float, weight: NDArray[np.float64], cell_m: float) -> float:
     """Return the length of a straight leg times the mean weight under it, sampled twice a cell."""
     rows, columns = weight.shape
@@ -323,8 +172,8 @@ def pull_tight(
     """Return the indices of the corners left when a path is pulled tight, the last point included.
 
     From each corner on, the next one is the farthest later point to which the straight leg keeps
-    ``clearance_m`` (``first_clearance_m`` on the first leg) and costs no more than the stretch of path that
-    it replaces. A corner's direct successor is always taken as seen. The first corner to see from is
+    ``clearance_m`` (``first_clearance_m`` on the first leg) and costs hardly more than the stretch of path
+    that it replaces. A corner's direct successor is always taken as seen. The first corner to see from is
     ``points[0]``, which is not among the returned ones.
     """
     count = points.shape[0]
@@ -342,8 +191,7 @@ def pull_tight(
         nxt = count - 1
         while nxt > at + 1:
             bx, by = points[nxt]
-            # Legs of equal cost differ by rounding.
-            allowed = (cost[nxt] - cost[at]) * (1.1)
+            allowed = _SLACK * (cost[nxt] - cost[at])
             if (
                 _leg_cost(ax, ay, bx, by, weight, cell_m) <= allowed
                 and segment_clearance(ax, ay, bx, by, boxes, circles, need) >= need

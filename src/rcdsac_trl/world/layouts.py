@@ -102,9 +102,7 @@ def _free_walls(inside: _Region, rng: np.random.Generator) -> list[Box]:
     return walls
 
 
-def _divide(
-    region: _Region, corridors: int, corridor_width_m: Range, rng: np.random.Generator
-) -> list[_Region]:
+def _divide(region: _Region, corridors: int, corridor_width_m: Range, rng: np.random.Generator) -> list[_Region]:
     """Halve a rectangle across its longer side until the rooms are small, at first by corridors."""
     sides = [region.high[i] - region.low[i] for i in range(2)]
     axis = int(rng.integers(2)) if sides[0] == sides[1] else int(sides[1] > sides[0])
@@ -141,10 +139,7 @@ def _inner_walls(regions: list[_Region], door_width_m: Range, rng: np.random.Gen
         if (edge := _shared_edge(regions[i], regions[j])) is not None
     }
     # Corridors open into each other first, rooms are rather reached from a corridor than through a room.
-    rank = {
-        pair: (2 - regions[pair[0]].corridor - regions[pair[1]].corridor) + float(rng.random())
-        for pair in edges
-    }
+    rank = {pair: (2 - regions[pair[0]].corridor - regions[pair[1]].corridor) + float(rng.random()) for pair in edges}
     joined = list(range(len(regions)))
     stretches: dict[tuple[int, float], list[Range]] = defaultdict(list)
     for i, j in sorted(edges, key=rank.__getitem__):
@@ -162,9 +157,7 @@ def _inner_walls(regions: list[_Region], door_width_m: Range, rng: np.random.Gen
             continue
         joined = [joined[i] if group == joined[j] else group for group in joined]
         line += [(edge.low - half, opening[0]), (opening[1], edge.high + half)]
-    return [
-        _wall(axis, at, low, high) for (axis, at), line in stretches.items() for low, high in _merge(line)
-    ]
+    return [_wall(axis, at, low, high) for (axis, at), line in stretches.items() for low, high in _merge(line)]
 
 
 def _door(edge: _Edge, door_width_m: Range, rng: np.random.Generator) -> Range | None:

@@ -15,9 +15,10 @@ import numpy as np
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.clutter import ClutterSite
-from rcdsac_trl.world.geometry import CELL_M, ROBOT_RADIUS_M, label_components
+from rcdsac_trl.world.geometry import CELL_M, ROBOT_RADIUS_M
 from rcdsac_trl.world.layouts import build_walls
-from rcdsac_trl.world.shapes import CLEARANCE_MARGIN_M, Box, Cylinder, Map, Mover
+from rcdsac_trl.world.search import label_components
+from rcdsac_trl.world.shapes import CLEARANCE_MARGIN_M, WAYPOINT_CLEARANCE_M, Box, Cylinder, Map, Mover
 
 __all__ = ["LAYOUTS", "SPLITS", "Box", "Cylinder", "Map", "MapSettings", "Mover", "Split", "generate_map"]
 
@@ -50,6 +51,10 @@ class MapSettings:
         mover_radius_m: smallest and largest radius of a mover, m.
         mover_speed_m_per_s: smallest and largest top speed of a mover, m/s.
         clearance_margin_m: what is kept free beyond the robot's radius, m.
+        waypoint_clearance_m: clearance that waypoints keep where that costs little, m; the less, the closer
+            they lead around corners.
+        detour_m: how far around the places that an unmapped piece takes a way past it may lead, m; the less,
+            the shorter the detours.
 
     Raises:
         UserInputError: a value is outside its limits.
@@ -66,6 +71,8 @@ class MapSettings:
     mover_radius_m: tuple[float, float] = (0.2, 0.3)
     mover_speed_m_per_s: tuple[float, float] = (0.2, 0.6)
     clearance_margin_m: float = CLEARANCE_MARGIN_M
+    waypoint_clearance_m: float = WAYPOINT_CLEARANCE_M
+    detour_m: float = 0.5
 
     def __post_init__(self) -> None:
         """Turn the lists of a YAML file into tuples and refuse what no map can be made from."""
@@ -87,6 +94,8 @@ class MapSettings:
         _check("clutter_per_m2", self.clutter_per_m2, 0.0, 1.0)
         _check("mapped_fraction", self.mapped_fraction, 0.0, 1.0)
         _check("clearance_margin_m", self.clearance_margin_m, 0.02, 0.2)
+        _check("waypoint_clearance_m", self.waypoint_clearance_m, 0.0, 2.0)
+        _check("detour_m", self.detour_m, 0.2, 3.0)
         # Narrower, and the grid might have no row of cells through a passage that is wide enough.
         passage_m = 2 * (ROBOT_RADIUS_M + self.clearance_margin_m) + CELL_M
         _check_range("corridor_width_m", self.corridor_width_m, passage_m, 5.0)
@@ -138,7 +147,8 @@ def generate_map(settings: MapSettings, split: Split, seed: int, index: int) -> 
         boxes=(*walls, *(piece for piece in site.pieces if isinstance(piece, Box))),
         cylinders=tuple(piece for piece in site.pieces if isinstance(piece, Cylinder)),
         movers=movers,
-        clearance_margin_m=settings.clearance_margin_m,
+        clearance_margin_m=float(settings.clearance_margin_m),
+        waypoint_clearance_m=float(settings.waypoint_clearance_m),
     )
 
 
@@ -146,7 +156,8 @@ def _connected_building(settings: MapSettings, layout: str, rng: np.random.Gener
     """Draw buildings until one is connected; a wall too short for its only door is rare."""
     for _ in range(_MAX_BUILDINGS):
         walls = build_walls(layout, settings.size_m, settings.corridor_width_m, settings.door_width_m, rng)
-        site = ClutterSite(walls, settings.size_m, ROBOT_RADIUS_M + settings.clearance_margin_m)
+        clearance_m = ROBOT_RADIUS_M + settings.clearance_margin_m
+        site = ClutterSite(walls, settings.size_m, clearance_m, settings.detour_m)
         if label_components(site.free)[1] == 1:
             return walls, site
     raise UserInputError(

@@ -17,20 +17,15 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.geometry import (
     CELL_M,
     ROBOT_RADIUS_M,
-    cheapest_path,
-    label_components,
     leg_clearance_m,
     lower_clearance,
-    nearest_cell,
     pull_tight,
     segment_clearance,
 )
+from rcdsac_trl.world.search import cheapest_path, label_components, nearest_cell
 from rcdsac_trl.world.shapes import Map
 
 Point = NDArray[np.float64] | tuple[float, float]
-
-COMFORT_M = 0.6
-"""Clearance that waypoints keep where that costs little, m: a robot that drives by them needs some room."""
 
 _TIGHT_COST = 3.0  # what a metre costs more where there is no room beyond the margin
 _ROUNDING_M = 1e-9
@@ -64,8 +59,9 @@ class _Layer:
         field = np.full((self.side, self.side), comfort_m)
         lower_clearance(field, self.boxes, self.circles, comfort_m, CELL_M)
         self.free = field >= clearance_m
-        tightness = (comfort_m - field) / max(comfort_m - clearance_m, _ROUNDING_M)
-        self.weight = 1.0 + _TIGHT_COST * np.minimum(tightness, 1.0)
+        self.weight = np.ones_like(field)
+        if comfort_m > clearance_m:
+            self.weight += _TIGHT_COST * np.minimum((comfort_m - field) / (comfort_m - clearance_m), 1.0)
         if reachable_only:
             labels, count = label_components(self.free)
             self.free = labels == 1 + np.argmax(np.bincount(labels.ravel(), minlength=count + 2)[1:])
@@ -139,12 +135,17 @@ class Planner:
             map: the map.
             robot_radius_m: circumradius of the robot.
             margin_m: what is kept free beyond a radius; the map's own margin when not given.
+
+        Raises:
+            UserInputError: the margin is too small for the grid, or the map has no free place.
         """
         margin_m = map.clearance_margin_m if margin_m is None else margin_m
         clearance_m = robot_radius_m + margin_m
+        if not leg_clearance_m(clearance_m) >= robot_radius_m:
+            raise UserInputError(f"margin_m={margin_m} is less than a grid of {CELL_M:g} m needs: raise it to 0.02")
         self.map = map
         self._true = _Layer(map, clearance_m, clearance_m, reachable_only=True)
-        self._known = _Layer(map, clearance_m, max(clearance_m, COMFORT_M), mapped_only=True)
+        self._known = _Layer(map, clearance_m, max(clearance_m, map.waypoint_clearance_m), mapped_only=True)
         widest_m = max((mover.radius for mover in map.movers), default=robot_radius_m)
         self._mover = _Layer(map, widest_m + margin_m, widest_m + margin_m, reachable_only=True)
 

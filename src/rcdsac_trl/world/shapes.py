@@ -7,6 +7,7 @@ per episode by whoever needs them.
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,6 +18,9 @@ from rcdsac_trl.errors import UserInputError
 
 CLEARANCE_MARGIN_M = 0.05
 """Default of what the generator and the planner keep free beyond the robot's radius."""
+
+WAYPOINT_CLEARANCE_M = 0.6
+"""Default of the clearance that waypoints keep where that costs little."""
 
 FORMAT_VERSION = 1
 """Version of the JSON that :meth:`Map.to_json` writes."""
@@ -62,6 +66,17 @@ class Cylinder:
     mapped: bool
 
 
+def solid_arrays(pieces: Sequence[Box | Cylinder]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return boxes [n, 6] and circles [m, 3] as :mod:`rcdsac_trl.world.geometry` takes them."""
+    boxes = [
+        (box.x, box.y, box.half_x, box.half_y, math.cos(box.yaw), math.sin(box.yaw))
+        for box in pieces
+        if isinstance(box, Box)
+    ]
+    circles = [(piece.x, piece.y, piece.radius) for piece in pieces if isinstance(piece, Cylinder)]
+    return np.array(boxes, np.float64).reshape(-1, 6), np.array(circles, np.float64).reshape(-1, 3)
+
+
 @dataclass(frozen=True)
 class Mover:
     """A walking cylinder: radius in m, top speed in m/s. Where it walks is drawn per simulation."""
@@ -81,6 +96,7 @@ class Map:
         cylinders: round clutter.
         movers: what walks about.
         clearance_margin_m: beyond the robot's radius, the clearance at which the free space is connected.
+        waypoint_clearance_m: the clearance that waypoints keep where that costs little.
 
     Example:
         >>> crate = Box(x=1.0, y=2.0, half_x=0.5, half_y=0.25, yaw=0.0, mapped=True)
@@ -95,6 +111,7 @@ class Map:
     cylinders: tuple[Cylinder, ...]
     movers: tuple[Mover, ...]
     clearance_margin_m: float = CLEARANCE_MARGIN_M
+    waypoint_clearance_m: float = WAYPOINT_CLEARANCE_M
 
     def segments(self, mapped_only: bool = False) -> NDArray[np.float64]:
         """Return the sides of the boxes as float64 [n, 4]: x0, y0, x1, y1 in m.
@@ -114,8 +131,7 @@ class Map:
         Args:
             mapped_only: leave out what the planner does not know.
         """
-        rows = [(c.x, c.y, c.radius) for c in self.cylinders if c.mapped or not mapped_only]
-        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return self.solids(mapped_only)[1]
 
     def solids(self, mapped_only: bool = False) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the boxes [n, 6] and circles [m, 3] that :mod:`rcdsac_trl.world.geometry` works on.
@@ -123,12 +139,8 @@ class Map:
         Args:
             mapped_only: leave out what the planner does not know.
         """
-        rows = [
-            (box.x, box.y, box.half_x, box.half_y, math.cos(box.yaw), math.sin(box.yaw))
-            for box in self.boxes
-            if box.mapped or not mapped_only
-        ]
-        return np.array(rows, dtype=np.float64).reshape(-1, 6), self.circles(mapped_only)
+        pieces: list[Box | Cylinder] = [*self.boxes, *self.cylinders]
+        return solid_arrays([piece for piece in pieces if piece.mapped or not mapped_only])
 
     def to_json(self) -> str:
         """Return the map as JSON; :meth:`from_json` gives an equal map back, bit for bit."""

@@ -87,9 +87,7 @@ class Simulation:
         except pybullet.error:
             self._client = -1
         if self._client < 0:
-            raise UserInputError(
-                "PyBullet could not open its window: gui=true needs a display; use gui=false"
-            )
+            raise UserInputError("PyBullet could not open its window: gui=true needs a display; use gui=false")
         self._pose = (0.0, 0.0, 0.0)
         self._v_c = self._omega_c = 0.0
 
@@ -217,8 +215,7 @@ class Simulation:
                 lengths=[2.0 * _OBSTACLE_HALF_HEIGHT_M] * len(group),
                 collisionFramePositions=[(s.x, s.y, 0.0) for s in group],
                 collisionFrameOrientations=[
-                    pybullet.getQuaternionFromEuler((0.0, 0.0, s.yaw if isinstance(s, Box) else 0.0))
-                    for s in group
+                    pybullet.getQuaternionFromEuler((0.0, 0.0, s.yaw if isinstance(s, Box) else 0.0)) for s in group
                 ],
                 physicsClientId=self._client,
             )

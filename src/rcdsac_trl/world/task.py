@@ -5,6 +5,7 @@ holds state. Whoever steps the world calls these functions and keeps the state.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -95,6 +96,9 @@ class TaskSettings:
 
     def __post_init__(self) -> None:
         """Refuse what is outside the limits."""
+        for name in ("motor_steps", "odometry_noise_std"):
+            if not isinstance(getattr(self, name), Sequence):
+                raise UserInputError(f"{name}={getattr(self, name)} must be a list of numbers, such as [6, 7, 8]")
         # Hydra hands lists over; a frozen value keeps tuples.
         object.__setattr__(self, "motor_steps", tuple(self.motor_steps))
         object.__setattr__(self, "odometry_noise_std", tuple(self.odometry_noise_std))
@@ -103,8 +107,7 @@ class TaskSettings:
         modes = get_args(CollisionPenaltyMode)
         if self.collision_penalty_mode not in modes:
             raise UserInputError(
-                f"collision_penalty_mode={self.collision_penalty_mode!r} does not exist; "
-                f"choose {' or '.join(modes)}"
+                f"collision_penalty_mode={self.collision_penalty_mode!r} does not exist; choose {' or '.join(modes)}"
             )
         for name in ("waypoint_radius_m", "goal_radius_m", "min_path_m"):
             if not 0.0 < getattr(self, name) < math.inf:
@@ -119,8 +122,7 @@ class TaskSettings:
             raise UserInputError(f"range_dropout={self.range_dropout} is a probability; give 0 to 1")
         if len(self.odometry_noise_std) != 2 or not all(0.0 <= s < math.inf for s in self.odometry_noise_std):
             raise UserInputError(
-                f"odometry_noise_std={list(self.odometry_noise_std)} must be two numbers of 0 or more: "
-                "m/s and rad/s"
+                f"odometry_noise_std={list(self.odometry_noise_std)} must be two numbers of 0 or more: m/s and rad/s"
             )
         if self.action_delay_steps < 0:
             raise UserInputError(f"action_delay_steps={self.action_delay_steps} must be 0 or more")
@@ -256,18 +258,14 @@ def reward_components(
         array([-0.02,  0.  ,  0.5 ,  1.2 ,  0.  ], dtype=float32)
     """
     waypoint = 0.0 if in_contact else max(MIN_WAYPOINT_REWARD, max(0.0, v_c) * math.cos(theta_1))
-    if _inside_dead_band(omega_u):
-        angular = STRAIGHT_FACTOR
-    else:
-        angular = max(MIN_TURN_FACTOR, 1.0 - abs(omega_u) / TURN_SCALE)
+    turning = max(MIN_TURN_FACTOR, 1.0 - abs(omega_u) / TURN_SCALE)
+    angular = STRAIGHT_FACTOR if _inside_dead_band(omega_u) else turning
     goal = GOAL_REWARD if goal_reached else 0.0
     collision = COLLISION_REWARD if collided else 0.0
     return np.array([BASE_REWARD, goal, waypoint, angular, collision], dtype=np.float32)
 
 
-def total_reward(
-    components: ArrayLike, collision_weight: float | NDArray[np.float32] = 1.0
-) -> NDArray[np.float32]:
+def total_reward(components: ArrayLike, collision_weight: float | NDArray[np.float32] = 1.0) -> NDArray[np.float32]:
     """Return r = r_base + r_goal + r_waypoint * r_angular + w_coll * r_coll, float32 [...].
 
     Args:

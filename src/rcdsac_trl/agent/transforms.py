@@ -1,0 +1,132 @@
+"""Where beta comes from: drawn for an episode while collecting, set for a batch while updating.
+
+Public names::
+
+    EpisodeSampler(key, draw, *, seed, agent_ids, first_episode=0, fixed=None)   Transform, outside ParallelEnv
+    Relabel(measure, *, mode, per="transition", beta=None, generator=None)       batch, fraction -> batch
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.seeding import stream
+
+
+class EpisodeSampler(Transform):
+    """Tells each agent one number for a whole episode: its beta, or its collision weight.
+
+    The number of agent i in episode k derives from (seed, key, k, i) alone, so that neither the number of workers
+    nor what other agents do changes it. Every reset of an agent begins its next episode. A value that the reset
+    itself brings under `key` is taken instead of a draw.
+
+    Args:
+        key: where the number is written, ``[*batch, 1]``.
+        draw: turns a uniform number in [0, 1) and the episode's number into the number told.
+        seed: root seed.
+        agent_ids: global numbers of the agents, in the order of the flattened batch.
+        first_episode: number of the first episode.
+        fixed: one number for each agent, told in every episode instead of a draw.
+
+    Example:
+        >>> sampler = EpisodeSampler("risk", lambda u, episode: -2.0 * u, seed=0, agent_ids=range(10))
+        >>> TransformedEnv(make_env(num_workers=0), sampler).reset()["risk"].shape
+        torch.Size([10, 1])
+    """
+
+    def __init__(
+        self,
+        key: str,
+        draw: Callable[[float, int], float],
+        *,
+        seed: int,
+        agent_ids: Sequence[int],
+        first_episode: int = 0,
+        fixed: Sequence[float] | None = None,
+    ) -> None:
+        super().__init__(in_keys=[], out_keys=[key])
+        if fixed is not None and len(fixed) != len(agent_ids):
+            raise ValueError(f"{len(fixed)} fixed values for {len(agent_ids)} agents: give one for each")
+        self.key = key
+        self.draw = draw
+        self.seed = seed
+        self.agent_ids = tuple(agent_ids)
+        self.fixed = fixed
+        self._next_episodes = [first_episode] * len(self.agent_ids)
+        self._told = torch.zeros(len(self.agent_ids), 1)
+
+    def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        marked = None if tensordict is None else tensordict.get("_reset", None)
+        brought = None if tensordict is None else tensordict.get(self.key, None)
+        rows = range(len(self.agent_ids)) if marked is None else marked.flatten().nonzero().flatten().tolist()
+        for row in rows:
+            episode = self._next_episodes[row]
+            self._next_episodes[row] += 1
+            # A reset in the middle of a rollout carries the finished episode's number along: that is no request.
+            if brought is not None and marked is None:
+                self._told[row] = brought.reshape(-1)[row]
+            elif self.fixed is not None:
+                self._told[row] = self.fixed[row]
+            else:
+                u = stream(self.seed, self.key, episode, self.agent_ids[row]).random()
+                self._told[row] = self.draw(u, episode)
+        return tensordict_reset.set(self.key, self._told.clone().view(*tensordict_reset.batch_size, 1))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set(self.key, tensordict.get(self.key))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the key to the observations."""
+        observation_spec[self.key] = Unbounded((*observation_spec.shape, 1), device=observation_spec.device)
+        return observation_spec
+
+
+class Relabel:
+    """Sets the `risk` of a batch of sequences: the paper's *resample* and *stored*, or one beta for all.
+
+    Args:
+        measure: draws and widens beta.
+        mode: ``"resample"`` draws a fresh beta; ``"stored"`` keeps the one in the batch; ``"fixed"`` sets `beta`.
+        per: draw once for each ``"transition"`` or each ``"sequence"`` (resample only).
+        beta: the value of ``"fixed"``.
+        generator: source of the draws, on the batch's device (resample only).
+
+    Example:
+        >>> relabel = Relabel(PowerLaw(), mode="resample", generator=torch.Generator().manual_seed(0))
+        >>> relabel(TensorDict(batch_size=[3, 9]))["risk"].shape
+        torch.Size([3, 9, 1])
+    """
+
+    def __init__(
+        self,
+        measure: RiskMeasure,
+        *,
+        mode: Literal["resample", "stored", "fixed"],
+        per: Literal["transition", "sequence"] = "transition",
+        beta: float | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        if mode == "fixed" and beta is None:
+            raise ValueError("mode='fixed' needs a beta")
+        if mode == "resample" and generator is None:
+            raise ValueError("mode='resample' needs a generator")
+        self.measure = measure
+        self.mode = mode
+        self.per = per
+        self.beta = beta
+        self.generator = generator
+
+    def __call__(self, batch: TensorDictBase, fraction: float = 1.0) -> TensorDictBase:
+        """Set `risk` ``[B, L + 1, 1]``; `fraction` of the measure's range is open around neutral."""
+        sequences, slots = batch.shape
+        if self.mode == "fixed" and self.beta is not None:
+            return batch.set("risk", torch.full((sequences, slots, 1), self.beta, device=batch.device))
+        if self.mode == "resample" and self.generator is not None:
+            drawn = self.measure.sample((sequences, slots if self.per == "transition" else 1, 1), self.generator)
+            return batch.set("risk", self.measure.widen(drawn, fraction).expand(sequences, slots, 1))
+        return batch

@@ -1,0 +1,202 @@
+"""Draw how a run learnt: ``python -m rcdsac_trl.plot_training run=<folder>``.
+
+Every panel shows one metric against the number of updates: bold lines are validation, one for each beta (or
+collision weight) and the mean over its episodes; the faint line is the mean over an iteration's training episodes,
+which are driven with exploration and with betas of all kinds.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
+from omegaconf import DictConfig, OmegaConf
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline.cli import entry_point
+
+PANELS: Mapping[str, str] = {
+    "reward": "reward per episode",
+    "collisions": "collisions per episode",
+    "goals": "goals per episode",
+    "mean_speed_m_per_s": "mean speed, m/s",
+    "contact_fraction": "steps in contact",
+}
+"""The metrics of :mod:`rcdsac_trl.pipeline.metrics` in the order of the panels, and what stands above each."""
+
+_CONDITIONS = ("beta", "collision_weight")
+_SYMBOLS = {"beta": "β", "collision_weight": "w_coll"}
+# Dark is the lowest value; the map's pale end is left out. Shapes tell the lines apart where colours do not.
+_COLORS = matplotlib.colormaps["viridis"]
+_PALEST = 0.85
+_MARKERS = "osD^vP"
+_INK = "#3d4450"
+_FAINT = "#9aa3b2"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of every panel: the means of each metric, indexed by the number of updates."""
+
+    label: str
+    color: str | tuple[float, float, float, float]
+    marker: str
+    means: pd.DataFrame
+
+
+def validation_curves(episodes: pd.DataFrame) -> list[Curve]:
+    """Return one curve for each beta or collision weight, from the lowest to the highest.
+
+    Args:
+        episodes: one row an episode, as training writes ``validation_episodes.csv``.
+    """
+    groups = sorted(episodes.groupby(list(_CONDITIONS), dropna=False), key=lambda group: group[0])
+    curves = []
+    for number, (values, rows) in enumerate(groups):
+        named = [(key, value) for key, value in zip(_CONDITIONS, values, strict=True) if pd.notna(value)]
+        label = ", ".join(f"{_SYMBOLS[key]} = {value:g}" for key, value in named) or "validation"
+        color = _COLORS(_PALEST * number / max(len(groups) - 1, 1))
+        curves.append(Curve(label, color, _MARKERS[number % len(_MARKERS)], _means(rows)))
+    return curves
+
+
+def best_updates(episodes: pd.DataFrame) -> int:
+    """Return the number of updates at which training saved its best checkpoint.
+
+    Args:
+        episodes: as for :func:`validation_curves`.
+    """
+    # As the trainer does it: every condition counts the same, and only a higher score replaces the best.
+    by_condition = episodes.groupby(["updates", *_CONDITIONS], dropna=False)["reward"].mean()
+    return int(by_condition.groupby("updates").mean().idxmax())
+
+
+def learning_curve(title: str, training: pd.DataFrame, validation: pd.DataFrame | None) -> Figure:
+    """Return the figure of one run.
+
+    Args:
+        title: what stands above the panels.
+        training: ``training_episodes.csv``.
+        validation: ``validation_episodes.csv``; None before the first validation.
+    """
+    curves = [] if validation is None else validation_curves(validation)
+    best = None if validation is None else best_updates(validation)
+    faint = Curve("training episodes", _FAINT, "", _means(training))
+    figure = Figure(figsize=(11.0, 6.2), layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=13, color=_INK)
+    for number, (metric, heading) in enumerate(PANELS.items(), start=1):
+        axes = figure.add_subplot(2, 3, number)
+        axes.set_title(heading, loc="left", fontsize=10, color=_INK)
+        _draw_curve(axes, faint, metric, linewidth=1.2, alpha=0.8)
+        for curve in curves:
+            _draw_curve(axes, curve, metric, linewidth=1.9)
+        if best is not None:
+            axes.axvline(best, color=_INK, linewidth=0.9, linestyle=(0, (1, 2)), zorder=0)
+        _style(axes, metric)
+    _draw_legend(figure, [faint, *curves], best)
+    return figure
+
+
+def _means(episodes: pd.DataFrame) -> pd.DataFrame:
+    return episodes.groupby("updates")[list(PANELS)].mean()
+
+
+def _draw_curve(axes: Axes, curve: Curve, metric: str, linewidth: float, alpha: float = 1.0) -> None:
+    # A long run has too many validations for a marker at each.
+    step = max(1, len(curve.means) // 12)
+    axes.plot(
+        curve.means.index,
+        curve.means[metric],
+        color=curve.color,
+        linewidth=linewidth,
+        alpha=alpha,
+        marker=curve.marker,
+        markersize=5,
+        markevery=step,
+    )
+
+
+def _style(axes: Axes, metric: str) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(_FAINT)
+    axes.tick_params(color=_FAINT, labelcolor=_INK, labelsize=9)
+    axes.grid(color="#e9ebef", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    axes.set_xlabel("updates", fontsize=9, color=_INK)
+    if metric == "contact_fraction":
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=None))
+    if metric != "reward":  # the others begin at nothing, and a panel that shows it cannot exaggerate
+        axes.set_ylim(bottom=0)
+
+
+def _draw_legend(figure: Figure, curves: list[Curve], best: int | None) -> None:
+    """Fill the free panel with what the lines mean."""
+    axes = figure.add_subplot(2, 3, len(PANELS) + 1)
+    axes.set_axis_off()
+    handles = [
+        Line2D([], [], color=curve.color, marker=curve.marker, markersize=6, linewidth=2, label=curve.label)
+        for curve in curves
+    ]
+    if best is not None:
+        handles.append(
+            Line2D([], [], color=_INK, linewidth=0.9, linestyle=(0, (1, 2)), label=f"best checkpoint ({best:,} updates)")
+        )
+    axes.legend(handles=handles, loc="center left", frameon=False, fontsize=10, labelcolor=_INK)
+
+
+def _run_folder(cfg: DictConfig) -> Path:
+    """Return the run's folder.
+
+    Raises:
+        UserInputError: if none is named, or it holds no episodes.
+    """
+    if cfg.run is None:
+        raise UserInputError("name what to draw: run=<folder> that training wrote")
+    folder = Path(str(cfg.run))
+    for name in ("config.yaml", "training_episodes.csv"):
+        if not (folder / name).is_file():
+            raise UserInputError(
+                f"run={folder} holds no {name}: name a folder that training wrote, after its first iteration"
+            )
+    return folder
+
+
+def _picture(cfg: DictConfig) -> Path:
+    out = Path(cfg.run) / "learning_curve.png" if cfg.out is None else Path(str(cfg.out))
+    if out.suffix != ".png":
+        raise UserInputError(f"out={out} does not name a PNG file: end it in .png")
+    return out
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse what cannot be drawn, before anything is written."""
+    _run_folder(cfg)
+    _picture(cfg)
+
+
+@entry_point("plot_training", check=check)
+def main(cfg: DictConfig) -> None:
+    """Write the picture."""
+    folder, out = _run_folder(cfg), _picture(cfg)
+    trained = OmegaConf.load(folder / "config.yaml")
+    validation = folder / "validation_episodes.csv"
+    figure = learning_curve(
+        f"{trained.algo.name}, sensor {trained.sensor.name}, seed {trained.seed}",
+        pd.read_csv(folder / "training_episodes.csv"),
+        pd.read_csv(validation) if validation.is_file() else None,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=130)
+    print(f"drew {out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,419 @@
+"""The loss against hand-computed numbers, TorchRL's own SAC, and TorchRL's idiom."""
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate
+from torchrl.objectives.utils import ValueEstimators
+
+from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
+from rcdsac_trl.agent.losses import DistributionalSACLoss, quantile_huber_loss, squash
+from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
+
+SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
+LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
+
+
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
+def make_batch(sequences: int = 3, steps: int = 4, beta: float | None = None) -> TensorDict:
+    shape = (sequences, steps + 1)
+    content = {"range": torch.rand(*shape, 180)} | {k: torch.randn(*shape, n) for k, n in OBSERVATIONS.items()}
+    content["action"] = 2.0 * torch.rand(*shape, 2) - 1.0
+    content["risk"] = torch.full((*shape, 1), beta) if beta is not None else -2.0 * torch.rand(*shape, 1)
+    content["next"] = {"reward": torch.randn(*shape, 1), "terminated": torch.rand(*shape, 1) < 0.3}
+    return TensorDict(content, batch_size=shape)
+
+
+def make_loss(kind: str = "rcdsac", number: int = 2, **settings: object) -> DistributionalSACLoss:
+    measure = PowerLaw()
+    told = measure if kind == "rcdsac" else None
+    critic = "scalar" if kind == "sac" else "quantile"
+    loss = DistributionalSACLoss(
+        build_actor(2, OBSERVATIONS, told, SMALL),
+        [build_critic(2, OBSERVATIONS, critic, told, SMALL) for _ in range(number)],
+        measure=measure,
+        generator=torch.Generator().manual_seed(3),
+        **settings,  # type: ignore[arg-type]
+    )
+    loss.make_value_estimator(gamma=0.9)
+    SoftUpdate(loss, eps=0.99)
+    return loss
+
+
+# ------------------------------------------------------------------------------------------------ pure functions
+def test_quantile_huber_by_hand() -> None:
+    # delta = 2 (beyond kappa) and -0.5 (inside); fractions 0.25 and 0.75; two targets each.
+    quantiles = torch.tensor([0.0, 2.0], requires_grad=True)
+    targets, tau = torch.tensor([2.0, -0.5]), torch.tensor([0.25, 0.75])
+    # i=1: delta 2 -> 0.25 * 1.5, delta -0.5 -> 0.75 * 0.125; i=2: delta 0 -> 0, delta -2.5 -> 0.25 * 2.0
+    expected = ((0.25 * 1.5 + 0.75 * 0.125) + (0.0 + 0.25 * 2.0)) / 2.0
+    loss = quantile_huber_loss(quantiles, targets, tau)
+    assert loss.item() == pytest.approx(expected)
+    loss.backward()
+    # slope -delta inside and -sign(delta) beyond, times the weight
+    assert quantiles.grad is not None
+    assert quantiles.grad.tolist() == pytest.approx([(-0.25 * 1.0 + 0.75 * 0.5) / 2.0, 0.25 * 1.0 / 2.0])
+
+
+def test_quantile_huber_sums_over_predictions_and_averages_over_targets() -> None:
+    quantiles, targets, tau = torch.randn(2, 3, 4), torch.randn(2, 3, 5), torch.rand(2, 1, 4)
+    for kappa in (0.3, 1.0, 5.0):
+        expected = torch.zeros(2, 3)
+        for b in range(2):
+            for t in range(3):
+                for i in range(4):
+                    for j in range(5):
+                        x = float(targets[b, t, j] - quantiles[b, t, i])
+                        huber = 0.5 * x * x if abs(x) <= kappa else kappa * (abs(x) - 0.5 * kappa)
+                        expected[b, t] += abs(float(tau[b, 0, i]) - (x < 0)) * huber / kappa / 5
+        torch.testing.assert_close(quantile_huber_loss(quantiles, targets, tau, kappa), expected)
+
+
+def test_quantile_huber_is_least_at_the_quantile() -> None:
+    """With a small kappa the loss is the quantile loss: over 1..100 its minimum at tau = 0.8 lies at 80."""
+    targets, candidates = torch.arange(1.0, 101.0), torch.arange(1.0, 101.0).unsqueeze(-1)
+    loss = quantile_huber_loss(candidates, targets.expand(100, -1), torch.tensor([0.8]), kappa=1e-3)
+    assert candidates[loss.argmin()].item() == 80.0
+
+
+def test_squash_is_torchrls_tanh_normal() -> None:
+    loc, scale = 3.0 * torch.randn(50, 2, requires_grad=True), torch.rand(50, 2) + 0.1
+    noise = torch.randn(50, 2)
+    action, log_prob = squash(loc, scale, noise)
+    distribution = TanhNormal(loc, scale)
+    expected = distribution.base_dist.log_prob(loc + scale * noise) - distribution._t.log_abs_det_jacobian(
+        loc + scale * noise, action
+    ).sum(-1)
+    torch.testing.assert_close(action, (loc + scale * noise).tanh())
+    torch.testing.assert_close(log_prob, expected)
+    # Far out, tanh is 1 in float32 and log(1 - tanh^2) would be -inf.
+    _, far = squash(torch.tensor([[30.0]], requires_grad=True), torch.ones(1, 1), torch.zeros(1, 1))
+    assert far.item() == pytest.approx(-0.5 * math.log(2 * math.pi) - 2 * math.log(2) + 60.0, rel=1e-6)
+
+
+# ------------------------------------------------------------------------------------------------ by hand
+class Passes(nn.Module):
+    """An encoder that remembers a multiple of the observation."""
+
+    def __init__(self, factor: float) -> None:
+        super().__init__()
+        self.factor = nn.Parameter(torch.tensor(factor))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.factor * observation
+
+
+class LinearActor(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.slope = nn.Parameter(torch.tensor(0.3))
+        self.log_scale = nn.Parameter(torch.tensor(-0.5))
+
+    def forward(self, memory: Tensor, risk: Tensor) -> tuple[Tensor, Tensor]:
+        loc = self.slope * memory + 0.1 * risk
+        return loc, self.log_scale.exp().expand_as(loc)
+
+
+class LinearCritic(nn.Module):
+    def __init__(self, slope: float) -> None:
+        super().__init__()
+        self.slope = nn.Parameter(torch.tensor(slope))
+
+    def forward(self, memory: Tensor, action: Tensor, tau: Tensor, risk: Tensor) -> Tensor:
+        return memory + self.slope * action + tau * (2.0 + risk)
+
+
+def linear_loss(**settings: object) -> DistributionalSACLoss:
+    def network(factor: float, head: nn.Module, in_keys: list[str], out_keys: list[str]) -> TensorDictSequential:
+        return TensorDictSequential(
+            TensorDictModule(Passes(factor), in_keys=["observation"], out_keys=["memory"]),
+            TensorDictModule(head, in_keys=["memory", *in_keys], out_keys=out_keys),
+        )
+
+    keys = ["action", "tau", "risk"]
+    loss = DistributionalSACLoss(
+        network(1.0, LinearActor(), ["risk"], ["loc", "scale"]),
+        [network(f, LinearCritic(s), keys, ["quantiles"]) for f, s in ((0.5, 0.7), (0.8, -0.4))],
+        measure=CVaR(),
+        num_quantiles=3,
+        num_target_quantiles=2,
+        num_risk_samples=4,
+        alpha_init=0.2,
+        generator=torch.Generator().manual_seed(11),
+        **settings,  # type: ignore[arg-type]
+    )
+    loss.make_value_estimator(gamma=0.9)
+    SoftUpdate(loss, eps=0.99)
+    return loss
+
+
+def linear_batch() -> TensorDict:
+    content = {
+        "observation": torch.randn(2, 3, 1),
+        "action": torch.rand(2, 3, 1),
+        "risk": torch.tensor([[[0.3], [0.6], [0.9]], [[1.0], [0.2], [0.5]]]),
+        "next": {"reward": torch.randn(2, 3, 1), "terminated": torch.tensor([[0, 1, 0], [0, 0, 0]]).bool().unsqueeze(-1)},
+    }
+    return TensorDict(content, batch_size=(2, 3))
+
+
+def by_hand(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Compute the linear networks' losses of each transition in scalar arithmetic, from the same random numbers."""
+    g = torch.Generator().manual_seed(11)
+    next_noise = torch.randn((2, 2, 1), generator=g)
+    tau_target, tau = torch.rand((2, 1, 2), generator=g), torch.rand((2, 1, 3), generator=g)
+    noise, tau_risk = torch.randn((2, 2, 1), generator=g), torch.rand((2, 1, 4), generator=g)
+    p = {k: torch.tensor(v, requires_grad=True) for k, v in (("a", 1.0), ("s", 0.3), ("l", -0.5), ("f0", 0.5))}
+    p |= {k: torch.tensor(v, requires_grad=True) for k, v in (("f1", 0.8), ("c0", 0.7), ("c1", -0.4))}
+    p["log_alpha"] = torch.tensor(math.log(0.2), requires_grad=True)
+
+    def sample(o: Tensor, beta: Tensor, eps: Tensor) -> tuple[Tensor, Tensor]:
+        x = p["s"] * p["a"] * o + 0.1 * beta + p["l"].exp() * eps
+        log_normal = -0.5 * eps**2 - p["l"] - 0.5 * math.log(2 * math.pi)
+        return x.tanh(), log_normal - torch.log(1 - x.tanh() ** 2)
+
+    def z(k: int, o: Tensor, a: Tensor, t: Tensor, beta: Tensor, frozen: bool = False) -> Tensor:
+        f, c = (p[f"f{k}"].detach(), p[f"c{k}"].detach()) if frozen else (p[f"f{k}"], p[f"c{k}"])
+        return f * o + c * a + t * (2.0 + beta)
+
+    out: dict[str, list[Tensor]] = {key: [] for key in LOSSES}
+    for b in range(2):
+        for t in range(2):
+            o, o2, beta = batch["observation"][b, t, 0], batch["observation"][b, t + 1, 0], batch["risk"][b, t, 0]
+            with torch.no_grad():
+                a2, log_prob2 = sample(o2, beta, next_noise[b, t, 0])
+                targets = []
+                for tt in tau_target[b, 0]:
+                    value = torch.minimum(z(0, o2, a2, tt, beta), z(1, o2, a2, tt, beta)) - 0.2 * log_prob2
+                    alive = 0.0 if batch["next", "terminated"][b, t, 0] else 1.0
+                    targets.append(batch["next", "reward"][b, t, 0] + 0.9 * alive * value)
+            q = torch.zeros(())
+            for k in range(2):
+                for ti in tau[b, 0]:
+                    for target in targets:
+                        x = target - z(k, o, batch["action"][b, t, 0], ti, beta)
+                        huber = 0.5 * x**2 if abs(x) <= 1 else abs(x) - 0.5
+                        q = q + (ti - (x < 0).float()).abs() * huber / 2
+            out["loss_qvalue"].append(q)
+            a, log_prob = sample(o, beta, noise[b, t, 0])
+            values = [torch.stack([z(k, o, a, beta * ti, beta, True) for ti in tau_risk[b, 0]]).mean() for k in range(2)]
+            out["loss_actor"].append(0.2 * log_prob - torch.minimum(*values))
+            out["loss_alpha"].append(-p["log_alpha"] * (log_prob.detach() - 2.0))
+    return {key: torch.stack(value).view(2, 2) for key, value in out.items()}, p
+
+
+def test_losses_and_gradients_by_hand() -> None:
+    batch = linear_batch()
+    loss = linear_loss(reduction="none")
+    expected, p = by_hand(batch)
+    found = loss(batch)
+    for key in LOSSES:
+        torch.testing.assert_close(found[key], expected[key])
+    sum(expected[key].sum() for key in LOSSES).backward()
+    sum(found[key].sum() for key in LOSSES).backward()
+    actor, critics = loss.actor_network_params, loss.critic_network_params
+    pairs = [(actor["module", "0", "module", "factor"], "a"), (actor["module", "1", "module", "slope"], "s")]
+    pairs += [(actor["module", "1", "module", "log_scale"], "l"), (loss.log_alpha, "log_alpha")]
+    for k in range(2):
+        pairs.append((critics[str(k), "module", "0", "module", "factor"], f"f{k}"))
+        pairs.append((critics[str(k), "module", "1", "module", "slope"], f"c{k}"))
+    for parameter, name in pairs:
+        torch.testing.assert_close(parameter.grad, p[name].grad)
+
+
+def test_reduction() -> None:
+    batch = linear_batch()
+    none, mean, total = (linear_loss(reduction=r)(batch) for r in ("none", "mean", "sum"))
+    assert none.batch_size == (2, 2)
+    for key in LOSSES:
+        torch.testing.assert_close(mean[key], none[key].mean())
+        torch.testing.assert_close(total[key], none[key].sum())
+    assert all(value.shape == (2, 2) for value in none.values())
+    assert all(value.shape == () for value in mean.values())
+
+
+def test_diagnostics() -> None:
+    batch = linear_batch()
+    out = linear_loss()(batch)
+    assert set(out.keys()) == set(linear_loss().out_keys)
+    assert out["alpha"].item() == pytest.approx(0.2)
+    # d(loss_alpha)/d(log alpha) = entropy - target entropy = entropy + 2
+    assert out["loss_alpha"].item() == pytest.approx(math.log(0.2) * (out["entropy"].item() + 2.0), rel=1e-5)
+    spread = (2.0 + batch["risk"][:, :-1, 0]) * _fractions_of_the_prediction().std(-1, correction=0)
+    assert out["quantile_spread"].item() == pytest.approx(spread.mean().item(), rel=1e-5)
+    assert not any(out[key].requires_grad for key in out.keys() if key not in LOSSES)  # noqa: SIM118
+
+
+def _fractions_of_the_prediction() -> Tensor:
+    g = torch.Generator().manual_seed(11)
+    torch.randn((2, 2, 1), generator=g)
+    torch.rand((2, 1, 2), generator=g)
+    return torch.rand((2, 1, 3), generator=g)
+
+
+# ------------------------------------------------------------------------------------------------ structure
+@pytest.mark.parametrize("kind", ["rcdsac", "dsac", "sac"])
+@pytest.mark.parametrize("number", [1, 2])
+def test_each_loss_trains_its_own_parameters(kind: str, number: int) -> None:
+    loss, batch = make_loss(kind, number), make_batch()
+    owners = {"loss_actor": "actor_network_params", "loss_qvalue": "critic_network_params", "loss_alpha": "log_alpha"}
+    for key, owner in owners.items():
+        loss.zero_grad()
+        loss(batch)[key].backward()
+        for name, parameter in loss.named_parameters():
+            if name.startswith(owner):
+                assert parameter.grad is not None, name
+                assert name == "log_alpha" or "hidden" not in name or parameter.grad.abs().sum() > 0, name
+            else:
+                assert parameter.grad is None, name
+    assert not any(p.requires_grad for p in loss.target_critic_network_params.values(True, True))
+
+
+def test_every_parameter_is_trained() -> None:
+    loss = make_loss()
+    out = loss(make_batch())
+    sum(out[key] for key in LOSSES).backward()
+    assert all(p.grad is not None for p in loss.parameters())
+    encoders = [n for n, p in loss.named_parameters() if "conv_1.weight" in n and p.grad.abs().sum() > 0]
+    assert len(encoders) == 3  # one for the actor and one for each critic
+
+
+@pytest.mark.parametrize("kind", ["rcdsac", "sac"])
+def test_the_last_slots_outcome_is_ignored(kind: str) -> None:
+    batch = make_batch()
+    other = batch.clone()
+    for key in ("action", "risk", ("next", "reward")):
+        other[key][:, -1] = math.nan
+    other["next", "terminated"][:, -1] ^= True
+    first, second = make_loss(kind, reduction="none"), make_loss(kind, reduction="none")
+    second.load_state_dict(first.state_dict())
+    assert (first(batch) == second(other)).all()
+
+
+def test_burn_in_drops_the_first_transitions_and_keeps_their_memory() -> None:
+    batch = make_batch(steps=5, beta=-1.0)
+    loss = make_loss(burn_in=3, reduction="none")
+    found = loss(batch)
+    assert found.batch_size == (3, 2)
+    other = batch.clone()
+    other["action"][:, :3] = 0.0
+    other["next", "reward"][:, :3] = 9.0
+    loss.rng_state = torch.Generator().manual_seed(3).get_state()
+    assert (loss(other) == found).all()
+    other["range"][:, 0] = 0.0  # but what was seen is remembered
+    loss.rng_state = torch.Generator().manual_seed(3).get_state()
+    assert not (loss(other) == found).all()
+
+
+def test_no_bootstrap_beyond_termination() -> None:
+    batch = make_batch(beta=-1.0)
+    batch["next", "terminated"][:] = True
+    loss = make_loss(num_target_quantiles=5)
+    target = loss.compute_target(batch, loss.encode_actor(batch))
+    torch.testing.assert_close(target, batch["next", "reward"][:, :-1].expand(3, 4, 5))
+
+
+def test_a_constant_beta_collapses_to_the_same_losses() -> None:
+    batch = make_batch(beta=-0.7)
+    loss = make_loss(reduction="none")
+    found = loss(batch)
+    loss.rng_state = torch.Generator().manual_seed(3).get_state()
+    loss._risk = lambda batch: batch["risk"][:, :-1]  # type: ignore[method-assign]
+    for key, value in loss(batch).items():
+        torch.testing.assert_close(value, found[key], rtol=1e-5, atol=1e-6)
+
+
+def test_fractions_per_transition_and_per_sequence() -> None:
+    shapes = {}
+    for per in ("sequence", "transition"):
+        loss = make_loss(fractions_per=per)
+        fractions = loss._fractions(7, torch.zeros(3, 4))
+        assert fractions is not None
+        shapes[per] = fractions.shape
+        assert torch.isfinite(loss(make_batch())["loss_qvalue"])
+    assert shapes == {"sequence": (3, 1, 7), "transition": (3, 4, 7)}
+
+
+def test_current_and_next_step_share_their_transitions_beta() -> None:
+    """Beta of slot t must act on the transition from t to t+1 and on no other."""
+    batch = make_batch(steps=4)
+    loss = make_loss(reduction="none")
+    found = loss(batch)
+    other = batch.clone()
+    other["risk"][:, 2] = -0.123
+    loss.rng_state = torch.Generator().manual_seed(3).get_state()
+    changed = loss(other)
+    for key in ("loss_actor", "loss_qvalue"):
+        same = torch.isclose(changed[key], found[key], rtol=1e-4).all(0).tolist()
+        assert same == [True, True, False, True]
+
+
+def test_neutral_measure_and_risk_free_networks_ignore_beta() -> None:
+    batch = make_batch()
+    loss = make_loss("dsac", reduction="none")
+    loss.measure = Neutral()
+    found = loss(batch)
+    loss.rng_state = torch.Generator().manual_seed(3).get_state()
+    torch.testing.assert_close(loss(batch.clone().set("risk", torch.zeros(3, 5, 1))), found)
+
+
+def test_dsac_is_told_beta_by_the_measure_alone() -> None:
+    batch = make_batch(beta=-2.0)
+    loss = make_loss("dsac", reduction="none")
+    averse = loss(batch)
+    loss.rng_state = torch.Generator().manual_seed(3).get_state()
+    neutral = loss(make_batch_like(batch, 0.0))
+    torch.testing.assert_close(averse["loss_qvalue"], neutral["loss_qvalue"])
+    assert not torch.allclose(averse["loss_actor"], neutral["loss_actor"])
+
+
+def make_batch_like(batch: TensorDict, beta: float) -> TensorDict:
+    return batch.clone().set("risk", torch.full_like(batch["risk"], beta))
+
+
+# ------------------------------------------------------------------------------------------------ TorchRL's idiom
+def test_nested_keys_and_set_keys() -> None:
+    def network(head: nn.Module, in_keys: list, out_keys: list) -> TensorDictSequential:
+        return TensorDictSequential(
+            TensorDictModule(Passes(0.5), in_keys=[("agents", "observation")], out_keys=[("agents", "memory")]),
+            TensorDictModule(head, in_keys=[("agents", "memory"), *in_keys], out_keys=out_keys),
+        )
+
+    critic_keys = [("agents", "u"), ("agents", "fraction"), ("agents", "beta")]
+    losses = []
+    for nested in (True, False):
+        if nested:
+            loss = DistributionalSACLoss(
+                network(LinearActor(), [("agents", "beta")], [("agents", "mu"), ("agents", "sigma")]),
+                [network(LinearCritic(0.7), critic_keys, [("agents", "z")])],
+                measure=CVaR(),
+                keys={
+                    "action": ("agents", "u"),
+                    "risk": ("agents", "beta"),
+                    "tau": ("agents", "fraction"),
+                    "loc": ("agents", "mu"),
+                    "scale": ("agents", "sigma"),
+                },
+            )
+            loss.set_keys(reward=("agents", "r"), terminated=("agents", "over"))
+        losses.append(loss)
+    batch = linear_batch()
+    moved = TensorDict(batch_size=batch.batch_size)
+    for old, new in [("observation", "observation"), ("action", "u"), ("risk", "beta")]:
+        moved["agents", new] = batch[old]
+    moved["next", "agents", "r"] = batch["next", "reward"]
+    moved["next", "agents", "over"] = batch["next", "terminated"]
+    assert losses
+    assert set(losses[0].in_keys) == set(moved.keys(True, True))
