@@ -1,5 +1,6 @@
 """The TorchRL environment: specs, determinism over any number of workers, resets, seeds."""
 
+import itertools
 import math
 import os
 
@@ -170,7 +171,7 @@ def test_starts_and_goals_do_not_depend_on_what_the_agent_does() -> None:
     for quick, lazy in zip(fast, slow, strict=True):
         assert len(quick) > len(lazy) >= 2
         assert quick[: len(lazy)] == lazy
-        for one, other in zip(quick[:-1], quick[1:], strict=True):
+        for one, other in itertools.pairwise(quick):
             assert math.dist(one, other) >= 4.0  # the map is empty, so the path is the straight line
 
 
@@ -233,9 +234,7 @@ def test_a_collision_weight_scales_the_collision_reward_alone(num_workers: int) 
 
     plain, heavy = run(1.0), run(2.0)
     assert (plain["reward_components"][..., 4] < 0).any()
-    assert_equal(
-        plain.exclude("reward", "collision_weight"), heavy.exclude("reward", "collision_weight")
-    )
+    assert_equal(plain.exclude("reward", "collision_weight"), heavy.exclude("reward", "collision_weight"))
     difference = heavy["reward"] - plain["reward"]
     torch.testing.assert_close(difference, plain["reward_components"][..., 4:])
     assert (heavy["collision_weight"][:, 1:] == 2.0).all()
@@ -245,9 +244,7 @@ def test_a_collision_weight_scales_the_collision_reward_alone(num_workers: int) 
 def test_a_reset_brings_a_collision_weight_or_one(num_workers: int) -> None:
     env = make_env(SMALL, agent_ids=(0, 1), num_workers=num_workers, serial=True, weighted_collisions=True)
     assert (env.reset()["collision_weight"] == 1.0).all()
-    brought = TensorDict(
-        {"collision_weight": torch.full((*env.batch_size, 1), 0.5)}, batch_size=env.batch_size
-    )
+    brought = TensorDict({"collision_weight": torch.full((*env.batch_size, 1), 0.5)}, batch_size=env.batch_size)
     assert (env.reset(brought, set_state=False)["collision_weight"] == 0.5).all()
     env.close()
 

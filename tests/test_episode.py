@@ -27,7 +27,7 @@ class ScriptedPlanner:
         return np.array([1.0, 1.0])
 
     def sample_goal(self, rng: np.random.Generator, start: np.ndarray, min_path_m: float) -> np.ndarray:
-        return np.asarray(start) + (4.0, 0.0)
+        return np.asarray(start) + np.array([4.0, 0.0])
 
     def waypoints(self, start: tuple[float, float], goal: np.ndarray) -> np.ndarray:
         self.planned_from.append(tuple(start))
@@ -182,9 +182,11 @@ def test_reaching_the_goal_pays_and_brings_a_goal_drawn_from_the_last_one(script
 
 
 def test_the_velocity_observation_holds_what_was_measured_and_what_was_asked(scripted) -> None:
-    group, _, _ = scripted([StepResult((1.1, 1.0, 0.0), 0.3, -0.2, False)])
+    group, _, _ = scripted([StepResult((1.1, 1.0, 0.0), v, -0.2, False) for v in (0.3, 99.0)])
     group.step(np.array([[0.5, -0.5]]))
     assert group.buffers.velocity[0] == pytest.approx([0.3, -0.2, 0.4, -math.pi / 4])
+    group.step(np.array([[0.5, -0.5]]))
+    assert group.buffers.velocity[0, 0] == 10.0  # the spec's limit
 
 
 def test_a_delayed_action_acts_later_but_is_observed_and_paid_at_once(scripted) -> None:
@@ -256,9 +258,9 @@ def test_actions_that_are_none_are_refused(scripted, action: np.ndarray) -> None
     ],
 )
 def test_wrong_settings_are_refused_by_name(name: str, value: object) -> None:
-    good = dict(sensor="full", split="train", seed=0, agent_ids=(0,), first_episode=0, gui=False)
+    good: dict[str, object] = {"sensor": "full", "split": "train", "seed": 0, "agent_ids": (0,)}
     with pytest.raises(UserInputError, match=name):
-        core.AgentGroup(None, None, **(good | {name: value}))
+        core.AgentGroup(None, None, **({"first_episode": 0, "gui": False} | good | {name: value}))
 
 
 def test_an_agent_that_was_never_reset_says_so() -> None:

@@ -16,7 +16,7 @@ from torchrl.objectives.utils import ValueEstimators
 from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
 from rcdsac_trl.agent.losses import DistributionalSACLoss, quantile_huber_loss, squash
 from rcdsac_trl.agent.networks import Widths
-from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
+from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw
 
 SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -164,7 +164,10 @@ def linear_batch() -> TensorDict:
         "observation": torch.randn(2, 3, 1),
         "action": torch.rand(2, 3, 1),
         "risk": torch.tensor([[[0.3], [0.6], [0.9]], [[1.0], [0.2], [0.5]]]),
-        "next": {"reward": torch.randn(2, 3, 1), "terminated": torch.tensor([[0, 1, 0], [0, 0, 0]]).bool().unsqueeze(-1)},
+        "next": {
+            "reward": torch.randn(2, 3, 1),
+            "terminated": torch.tensor([[0, 1, 0], [0, 0, 0]]).bool().unsqueeze(-1),
+        },
     }
     return TensorDict(content, batch_size=(2, 3))
 
@@ -208,7 +211,9 @@ def by_hand(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]
                         q = q + (ti - (x < 0).float()).abs() * huber / 2
             out["loss_qvalue"].append(q)
             a, log_prob = sample(o, beta, noise[b, t, 0])
-            values = [torch.stack([z(k, o, a, beta * ti, beta, True) for ti in tau_risk[b, 0]]).mean() for k in range(2)]
+            values = [
+                torch.stack([z(k, o, a, beta * ti, beta, True) for ti in tau_risk[b, 0]]).mean() for k in range(2)
+            ]
             out["loss_actor"].append(0.2 * log_prob - torch.minimum(*values))
             out["loss_alpha"].append(-p["log_alpha"] * (log_prob.detach() - 2.0))
     return {key: torch.stack(value).view(2, 2) for key, value in out.items()}, p
@@ -385,35 +390,208 @@ def make_batch_like(batch: TensorDict, beta: float) -> TensorDict:
 
 # ------------------------------------------------------------------------------------------------ TorchRL's idiom
 def test_nested_keys_and_set_keys() -> None:
-    def network(head: nn.Module, in_keys: list, out_keys: list) -> TensorDictSequential:
+    def network(factor: float, head: nn.Module, in_keys: list, out_keys: list) -> TensorDictSequential:
         return TensorDictSequential(
-            TensorDictModule(Passes(0.5), in_keys=[("agents", "observation")], out_keys=[("agents", "memory")]),
+            TensorDictModule(Passes(factor), in_keys=[("agents", "observation")], out_keys=[("agents", "memory")]),
             TensorDictModule(head, in_keys=[("agents", "memory"), *in_keys], out_keys=out_keys),
         )
 
-    critic_keys = [("agents", "u"), ("agents", "fraction"), ("agents", "beta")]
-    losses = []
-    for nested in (True, False):
-        if nested:
-            loss = DistributionalSACLoss(
-                network(LinearActor(), [("agents", "beta")], [("agents", "mu"), ("agents", "sigma")]),
-                [network(LinearCritic(0.7), critic_keys, [("agents", "z")])],
-                measure=CVaR(),
-                keys={
-                    "action": ("agents", "u"),
-                    "risk": ("agents", "beta"),
-                    "tau": ("agents", "fraction"),
-                    "loc": ("agents", "mu"),
-                    "scale": ("agents", "sigma"),
-                },
-            )
-            loss.set_keys(reward=("agents", "r"), terminated=("agents", "over"))
-        losses.append(loss)
+    keys = [("agents", "u"), ("agents", "fraction"), ("agents", "beta")]
+    loss = DistributionalSACLoss(
+        network(1.0, LinearActor(), [("agents", "beta")], [("agents", "mu"), ("agents", "sigma")]),
+        [network(f, LinearCritic(s), keys, [("agents", "z")]) for f, s in ((0.5, 0.7), (0.8, -0.4))],
+        measure=CVaR(),
+        num_quantiles=3,
+        num_target_quantiles=2,
+        num_risk_samples=4,
+        alpha_init=0.2,
+        generator=torch.Generator().manual_seed(11),
+    )
+    loss.set_keys(action=("agents", "u"), risk=("agents", "beta"), tau=("agents", "fraction"))
+    loss.make_value_estimator(gamma=0.9)
+    loss.set_keys(reward=("agents", "r"), terminated=("agents", "over"))
+    SoftUpdate(loss, eps=0.99)
     batch = linear_batch()
     moved = TensorDict(batch_size=batch.batch_size)
     for old, new in [("observation", "observation"), ("action", "u"), ("risk", "beta")]:
         moved["agents", new] = batch[old]
     moved["next", "agents", "r"] = batch["next", "reward"]
     moved["next", "agents", "over"] = batch["next", "terminated"]
-    assert losses
-    assert set(losses[0].in_keys) == set(moved.keys(True, True))
+    assert set(loss.in_keys) == set(moved.keys(True, True))
+    expected = linear_loss()(batch)
+    assert (loss(moved) == expected).all()
+    with pytest.raises(ValueError, match="not an accepted tensordict key"):
+        loss.set_keys(colour="red")
+
+
+def test_only_td0() -> None:
+    with pytest.raises(NotImplementedError):
+        linear_loss().make_value_estimator(ValueEstimators.TDLambda)
+
+
+def test_soft_update_moves_the_targets() -> None:
+    loss = make_loss()
+    updater = SoftUpdate(loss, eps=0.9)
+    online, target = loss.critic_network_params, loss.target_critic_network_params
+    key = ("0", "module", "1", "module", "hidden", "weight")
+    with torch.no_grad():
+        online[key].add_(1.0)
+    before = target[key].clone()
+    updater.step()
+    torch.testing.assert_close(target[key], before + 0.1)
+    out = loss(make_batch())
+    assert torch.isfinite(out["loss_qvalue"])
+
+
+def test_random_numbers_come_from_the_losses_generator() -> None:
+    batch, before = make_batch(), torch.random.get_rng_state()
+    loss = make_loss()
+    after_init = torch.random.get_rng_state()
+    first, second = loss(batch), loss(batch)
+    assert torch.equal(torch.random.get_rng_state(), after_init)
+    assert not torch.equal(before, after_init)  # weights are drawn from torch's global generator, nothing else is
+    assert first["loss_qvalue"] != second["loss_qvalue"]
+    state = loss.rng_state
+    third = loss(batch)
+    loss.rng_state = state
+    assert (loss(batch) == third).all()
+
+
+def test_state_dict_continues_bit_for_bit() -> None:
+    batch = make_batch()
+    loss, resumed = make_loss(), make_loss()
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    for _ in range(3):
+        optimizer.zero_grad()
+        sum(loss(batch)[key] for key in LOSSES).backward()
+        optimizer.step()
+    resumed.load_state_dict(loss.state_dict())
+    copied = copy.deepcopy(loss)
+    expected = loss(batch)
+    assert (resumed(batch) == expected).all()
+    assert (copied(batch) == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"number": 0}, "at least one critic"),
+        ({"num_quantiles": 0}, "at least 1"),
+        ({"alpha_init": 0.0}, "above 0"),
+        ({"kappa": -1.0}, "above 0"),
+        ({"burn_in": -1}, "at least 0"),
+        ({"fractions_per": "batch"}, "'sequence' or 'transition'"),
+        ({"loss_function": "l3"}, "'smooth_l1' or 'l2'"),
+        ({"reduction": "median"}, "'mean', 'sum' or 'none'"),
+    ],
+)
+def test_wrong_arguments(settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_loss(**settings)
+
+
+def test_quantile_critics_need_a_measure() -> None:
+    with pytest.raises(ValueError, match="need a risk measure"):
+        DistributionalSACLoss(build_actor(), [build_critic()])
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (3,), (2, 3, 5)])
+def test_wrong_batches(shape: tuple[int, ...]) -> None:
+    batch = TensorDict({"range": torch.rand(*shape, 180)}, batch_size=shape)
+    with pytest.raises(ValueError, match="expected a batch"):
+        make_loss()(batch)
+
+
+# ------------------------------------------------------------------------------------------------ TorchRL's SAC
+class Columns(nn.Module):
+    """A feed-forward network on concatenated columns, for both losses."""
+
+    def __init__(self, size: int, outputs: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(size, 8), nn.Tanh(), nn.Linear(8, outputs))
+
+    def forward(self, *columns: Tensor) -> Tensor:
+        return self.layers(torch.cat(columns, dim=-1))
+
+
+class Policy(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.columns, self.split = Columns(3, 4), NormalParamExtractor()
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        return self.split(self.columns(observation))
+
+
+@pytest.mark.parametrize("loss_function", ["smooth_l1", "l2"])
+def test_scalar_mode_equals_torchrls_sac(loss_function: str) -> None:
+    """Same weights, batch and noise: one-step sequences with an encoder that passes the observation on."""
+    policy, critics = Policy(), [Columns(5, 1), Columns(5, 1)]
+    their_policy = copy.deepcopy(policy)
+    theirs = SACLoss(
+        ProbabilisticActor(
+            TensorDictModule(their_policy, in_keys=["observation"], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            spec=Bounded(-1, 1, (2,)),
+            distribution_class=TanhNormal,
+        ),
+        [ValueOperator(copy.deepcopy(c), in_keys=["observation", "action"]) for c in critics],
+        loss_function=loss_function,
+        alpha_init=0.3,
+        target_entropy=-2.0,
+    )
+    theirs.make_value_estimator(gamma=0.9)
+
+    def network(head: nn.Module, in_keys: list[str], out_keys: list[str]) -> TensorDictSequential:
+        return TensorDictSequential(
+            TensorDictModule(nn.Identity(), in_keys=["observation"], out_keys=["memory"]),
+            TensorDictModule(head, in_keys=["memory", *in_keys], out_keys=out_keys),
+        )
+
+    generator = torch.Generator().manual_seed(5)
+    ours = DistributionalSACLoss(
+        network(policy, [], ["loc", "scale"]),
+        [network(critic, ["action"], ["state_action_value"]) for critic in critics],
+        loss_function=loss_function,  # type: ignore[arg-type]
+        alpha_init=0.3,
+        target_entropy=-2.0,
+        generator=generator,
+    ).make_value_estimator(gamma=0.9)
+    for loss in (theirs, ours):  # targets that differ from the online critics
+        updater = SoftUpdate(loss, eps=0.5)
+        params = loss.qvalue_network_params if loss is theirs else loss.critic_network_params
+        with torch.no_grad():
+            for value in params.values(True, True):
+                value.mul_(1.5)
+        updater.step()
+    number = 40
+    transition = TensorDict(
+        {
+            "observation": torch.randn(number, 3),
+            "action": 2.0 * torch.rand(number, 2) - 1.0,
+            "next": {
+                "observation": torch.randn(number, 3),
+                "reward": torch.randn(number, 1),
+                "terminated": torch.rand(number, 1) < 0.2,
+                "done": torch.zeros(number, 1, dtype=torch.bool),
+            },
+        },
+        batch_size=[number],
+    )
+    sequence = TensorDict(batch_size=[number, 2])
+    sequence["observation"] = torch.stack((transition["observation"], transition["next", "observation"]), dim=1)
+    for key in ("action", ("next", "reward"), ("next", "terminated")):
+        sequence[key] = torch.stack((transition[key], transition[key]), dim=1)
+    torch.manual_seed(5)  # both draw the next action's noise first, then the action's
+    expected, found = theirs(transition), ours(sequence)
+    for key in (*LOSSES, "alpha", "entropy"):
+        torch.testing.assert_close(found[key], expected[key], rtol=1e-5, atol=1e-6)
+    for losses in (expected, found):
+        sum(losses[key] for key in LOSSES).backward()
+    for mine, other in zip(policy.parameters(), their_policy.parameters(), strict=True):
+        torch.testing.assert_close(mine.grad, other.grad)
+    for k, critic in enumerate(critics):
+        torch.testing.assert_close(
+            critic.layers[0].weight.grad, theirs.qvalue_network_params["module", "layers", "0", "weight"].grad[k]
+        )
+    torch.testing.assert_close(ours.log_alpha.grad, theirs.log_alpha.grad)

@@ -1,1 +1,38 @@
-"""Risk-conditioned distributional soft actor-critic for risk-sensitive navigation, on TorchRL."""
+"""Risk-conditioned distributional soft actor-critic for risk-sensitive navigation, on TorchRL.
+
+Three rooms: :mod:`rcdsac_trl.world` is what exists, :mod:`rcdsac_trl.agent` is what learns, and
+:mod:`rcdsac_trl.pipeline` is what happens. World and agent do not know each other: they meet in these keys, each with
+the shape of one agent's entry.
+
+| key | shape, type | unit, values | written by | read by |
+|---|---|---|---|---|
+| `range` | 180 f32 | 2.5 + log10 m: 0, or 0.5 to 2.98 | env | encoders |
+| `waypoint` | 6 f32 | log10 m, cos, sin; of the next two | env | encoders, pursuit |
+| `velocity` | 4 f32 | m/s, rad/s measured; m/s, rad/s desired | env | encoders, metrics |
+| `action` | 2 f32 | -1 to 1 | actor | env, critics |
+| `risk` | 1 f32 | raw beta | EpisodeSampler, Relabel | actor, critics, psi |
+| `collision_weight` | 1 f32 | w_coll, RCWR only | EpisodeSampler | encoders, env, replay |
+| `reward` | 1 f32 | below "next" only | env, replay | loss |
+| `reward_components` | 5 f32 | base, goal, waypoint, angular, collision | env | metrics, replay |
+| `contact`, `goal_reached` | 1 bool | in the step before | env | metrics |
+| `pose` | 3 f32 | m, m, rad; map frame | env | drawing only |
+| `terminated` | 1 bool | never true | env, replay | loss |
+| `truncated`, `done` | 1 bool | true after the last step | StepCounter | collector |
+| `step_count` | 1 i64 | agent steps | StepCounter | StepCounter |
+| `is_init` | 1 bool | true at the first step | InitTracker | actor |
+| `recurrent_state` | 128 f32 | zero at reset, not in the replay | actor | actor |
+"""
+
+
+def register_gym() -> None:
+    """Register ``RCDSACNavigation-v0`` with Gymnasium, for ``gymnasium.make``; harmless when done before.
+
+    Example:
+        >>> import gymnasium
+        >>> register_gym()
+        >>> env = gymnasium.make("RCDSACNavigation-v0", sensor="sparse")
+    """
+    # Imported late, so that importing the package stays instant.
+    from rcdsac_trl.world import gym
+
+    gym.register()

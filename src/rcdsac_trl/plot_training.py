@@ -2,7 +2,8 @@
 
 Every panel shows one metric against the number of updates: bold lines are validation, one for each beta (or
 collision weight) and the mean over its episodes; the faint line is the mean over an iteration's training episodes,
-which are driven with exploration and with betas of all kinds.
+which are driven with exploration and with betas of all kinds. It may leave the panels of reward and collisions for a
+while: a few disastrous iterations at the start would flatten all that follows.
 """
 
 from collections.abc import Mapping
@@ -37,6 +38,10 @@ _PALEST = 0.85
 _MARKERS = "osD^vP"
 _INK = "#3d4450"
 _FAINT = "#9aa3b2"
+_DOTS = (0, (1, 2))
+# Metrics that have no bound, and the share of the training iterations at either end that may leave their panels.
+_UNBOUNDED = ("reward", "collisions")
+_OUTSIDE = 0.05
 
 
 @dataclass(frozen=True)
@@ -55,11 +60,15 @@ def validation_curves(episodes: pd.DataFrame) -> list[Curve]:
     Args:
         episodes: one row an episode, as training writes ``validation_episodes.csv``.
     """
-    groups = sorted(episodes.groupby(list(_CONDITIONS), dropna=False), key=lambda group: group[0])
+    # Groups come in ascending order.
+    groups = list(episodes.groupby(list(_CONDITIONS), dropna=False))
     curves = []
     for number, (values, rows) in enumerate(groups):
-        named = [(key, value) for key, value in zip(_CONDITIONS, values, strict=True) if pd.notna(value)]
-        label = ", ".join(f"{_SYMBOLS[key]} = {value:g}" for key, value in named) or "validation"
+        # A missing value is not equal to itself: a condition has one of the two, or neither.
+        named = [
+            f", {_SYMBOLS[key]} = {value:g}" for key, value in zip(_CONDITIONS, values, strict=True) if value == value
+        ]
+        label = "validation" + "".join(named)
         color = _COLORS(_PALEST * number / max(len(groups) - 1, 1))
         curves.append(Curve(label, color, _MARKERS[number % len(_MARKERS)], _means(rows)))
     return curves
@@ -73,7 +82,8 @@ def best_updates(episodes: pd.DataFrame) -> int:
     """
     # As the trainer does it: every condition counts the same, and only a higher score replaces the best.
     by_condition = episodes.groupby(["updates", *_CONDITIONS], dropna=False)["reward"].mean()
-    return int(by_condition.groupby("updates").mean().idxmax())
+    scores = by_condition.groupby("updates").mean()
+    return int(scores.index.to_numpy()[scores.to_numpy().argmax()])
 
 
 def learning_curve(title: str, training: pd.DataFrame, validation: pd.DataFrame | None) -> Figure:
@@ -96,10 +106,24 @@ def learning_curve(title: str, training: pd.DataFrame, validation: pd.DataFrame 
         for curve in curves:
             _draw_curve(axes, curve, metric, linewidth=1.9)
         if best is not None:
-            axes.axvline(best, color=_INK, linewidth=0.9, linestyle=(0, (1, 2)), zorder=0)
-        _style(axes, metric)
+            axes.axvline(best, color=_INK, linewidth=0.9, linestyle=_DOTS, zorder=0)
+        _style(axes)
+        _set_limits(axes, metric, faint, curves)
     _draw_legend(figure, [faint, *curves], best)
     return figure
+
+
+def draw_run(folder: Path, out: Path) -> None:
+    """Write the figure of a run folder as a PNG file."""
+    trained = OmegaConf.load(folder / "config.yaml")
+    validation = folder / "validation_episodes.csv"
+    figure = learning_curve(
+        f"{trained.algo.name}, sensor {trained.sensor.name}, seed {trained.seed}",
+        pd.read_csv(folder / "training_episodes.csv"),
+        pd.read_csv(validation) if validation.is_file() else None,
+    )
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=130)
 
 
 def _means(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -121,7 +145,7 @@ def _draw_curve(axes: Axes, curve: Curve, metric: str, linewidth: float, alpha: 
     )
 
 
-def _style(axes: Axes, metric: str) -> None:
+def _style(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(_FAINT)
     axes.tick_params(color=_FAINT, labelcolor=_INK, labelsize=9)
@@ -131,10 +155,17 @@ def _style(axes: Axes, metric: str) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     axes.set_xlabel("updates", fontsize=9, color=_INK)
+
+
+def _set_limits(axes: Axes, metric: str, training: Curve, validation: list[Curve]) -> None:
     if metric == "contact_fraction":
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=None))
-    if metric != "reward":  # the others begin at nothing, and a panel that shows it cannot exaggerate
-        axes.set_ylim(bottom=0)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    outside = _OUTSIDE if metric in _UNBOUNDED else 0.0
+    usual = training.means[metric].quantile([outside, 1 - outside])
+    shown = pd.concat([usual, *(curve.means[metric] for curve in validation)])
+    margin = 0.06 * max(shown.max() - shown.min(), 1e-3)
+    # Whatever cannot be negative begins at nothing: a panel that shows it cannot exaggerate.
+    axes.set_ylim(shown.min() - margin if metric == "reward" else 0.0, shown.max() + margin)
 
 
 def _draw_legend(figure: Figure, curves: list[Curve], best: int | None) -> None:
@@ -146,9 +177,8 @@ def _draw_legend(figure: Figure, curves: list[Curve], best: int | None) -> None:
         for curve in curves
     ]
     if best is not None:
-        handles.append(
-            Line2D([], [], color=_INK, linewidth=0.9, linestyle=(0, (1, 2)), label=f"best checkpoint ({best:,} updates)")
-        )
+        label = f"best checkpoint ({best:,} updates)"
+        handles.append(Line2D([], [], color=_INK, linewidth=0.9, linestyle=_DOTS, label=label))
     axes.legend(handles=handles, loc="center left", frameon=False, fontsize=10, labelcolor=_INK)
 
 
@@ -185,16 +215,8 @@ def check(cfg: DictConfig) -> None:
 @entry_point("plot_training", check=check)
 def main(cfg: DictConfig) -> None:
     """Write the picture."""
-    folder, out = _run_folder(cfg), _picture(cfg)
-    trained = OmegaConf.load(folder / "config.yaml")
-    validation = folder / "validation_episodes.csv"
-    figure = learning_curve(
-        f"{trained.algo.name}, sensor {trained.sensor.name}, seed {trained.seed}",
-        pd.read_csv(folder / "training_episodes.csv"),
-        pd.read_csv(validation) if validation.is_file() else None,
-    )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=130)
+    out = _picture(cfg)
+    draw_run(_run_folder(cfg), out)
     print(f"drew {out}")
 
 

@@ -1,5 +1,7 @@
 """Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``."""
 
+from pathlib import Path
+
 from omegaconf import DictConfig
 
 from rcdsac_trl.pipeline.cli import entry_point
@@ -12,7 +14,14 @@ def check(cfg: DictConfig) -> None:
     build.check_training(cfg)
 
 
-@entry_point("train", check=check)
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that already holds a run, before Hydra writes into it."""
+    from rcdsac_trl.pipeline import logs
+
+    logs.check_folder(folder)
+
+
+@entry_point("train", check=check, check_folder=check_folder)
 def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
     from rcdsac_trl.pipeline import build

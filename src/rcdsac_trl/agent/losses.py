@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, TensorDictSequential, dispatch
+from tensordict.nn import TensorDictParams, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.objectives.common import LossModule
@@ -113,9 +113,10 @@ class DistributionalSACLoss(LossModule):
 
     Args:
         actor: encoder and head, from :func:`rcdsac_trl.agent.actor.build_actor`; any ``TensorDictSequential`` of two
-            modules will do whose first writes a memory ``[B, L+1, ..]`` and whose second writes ``loc``, ``scale``.
+            modules will do whose first writes a memory ``[B, L+1, ..]`` and whose second writes mean and scale of the
+            action before tanh.
         critics: one or two (or more) independent critics, from :func:`rcdsac_trl.agent.actor.build_critic`; the
-            head's out key decides between quantile (``"quantiles"``) and scalar (``"state_action_value"``).
+            head that reads ``tau`` is a quantile head, else it is scalar.
         measure: distorts the fractions of the actor loss; required with quantile critics.
         num_quantiles: N, fractions of the prediction.
         num_target_quantiles: N', fractions of the target.
@@ -149,8 +150,6 @@ class DistributionalSACLoss(LossModule):
             action: the action taken, ``[B, L+1, A]``.
             risk: the risk-measure parameter beta, ``[B, L+1, 1]``.
             tau: under which quantile critics read their fractions.
-            loc: under which the actor's head writes the mean before tanh.
-            scale: under which the actor's head writes the standard deviation before tanh.
             reward: below ``"next"``, ``[B, L+1, 1]``.
             terminated: below ``"next"``, ``[B, L+1, 1]`` bool.
         """
@@ -158,8 +157,6 @@ class DistributionalSACLoss(LossModule):
         action: NestedKey = "action"
         risk: NestedKey = "risk"
         tau: NestedKey = "tau"
-        loc: NestedKey = "loc"
-        scale: NestedKey = "scale"
         reward: NestedKey = "reward"
         terminated: NestedKey = "terminated"
 
@@ -209,10 +206,9 @@ class DistributionalSACLoss(LossModule):
             raise ValueError(f"loss_function = {loss_function!r} must be 'smooth_l1' or 'l2'")
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
-        self._distributional = self.tensor_keys.tau in critics[0][-1].in_keys
+        self._critics = tuple(critics)
         if self._distributional and measure is None:
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
-        self._critics = tuple(critics)
 
         self.convert_to_functional(actor, "actor_network")
         # One functional module for all critics: their parameters keep apart (a list given to TorchRL's own
@@ -284,6 +280,10 @@ class DistributionalSACLoss(LossModule):
         self.rng_state = state
 
     @property
+    def _distributional(self) -> bool:
+        return self.tensor_keys.tau in self._critics[0][1].in_keys
+
+    @property
     def alpha(self) -> Tensor:
         """The temperature, detached."""
         return self.log_alpha.detach().exp()
@@ -294,7 +294,6 @@ class DistributionalSACLoss(LossModule):
         return self.critic_network_params.detach()
 
     # ------------------------------------------------------------------------------------------- the losses
-    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the three losses and detached diagnostics of a batch ``[B, L+1]``.
 
@@ -409,7 +408,7 @@ class DistributionalSACLoss(LossModule):
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             entries = {self.actor_network[0].out_keys[0]: memory, self.tensor_keys.risk: risk}
             policy = _call(self.actor_network[1], entries)
-        loc, scale = policy.get(self.tensor_keys.loc), policy.get(self.tensor_keys.scale)
+        loc, scale = (policy.get(key) for key in self.actor_network[1].out_keys)
         noise = torch.randn(loc.shape, generator=self._generator, device=self._generator.device)
         return squash(loc, scale, noise.to(loc))
 

@@ -1,16 +1,18 @@
 """Hydra entry points whose mistakes end in one sentence and exit code 2, before anything is written."""
 
-import difflib
 import re
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import wraps
+from pathlib import Path
 from typing import NoReturn
 
 import hydra
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -18,17 +20,24 @@ from omegaconf.errors import OmegaConfBaseException
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.paths import CONF_DIR
 from rcdsac_trl.pipeline.runtime import keep_pages, quiet_libraries
+from rcdsac_trl.pipeline.typed import unknown_key
 
 Task = Callable[[DictConfig], None]
 
+# What a shell reports for a process that Ctrl-C ended.
+INTERRUPTED = 130
 
-def entry_point(config_name: str, *, check: Task) -> Callable[[Task], Callable[[], None]]:
+
+def entry_point(
+    config_name: str, *, check: Task, check_folder: Callable[[Path], None] | None = None
+) -> Callable[[Task], Callable[[], None]]:
     """Make a Hydra main of a task.
 
     Args:
         config_name: the root config in ``conf/``.
         check: called with the composed config before Hydra creates a folder; raises
             :class:`~rcdsac_trl.errors.UserInputError` for what cannot work.
+        check_folder: called likewise with the folder that Hydra is about to write into.
     """
 
     def decorate(task: Task) -> Callable[[], None]:
@@ -44,10 +53,13 @@ def entry_point(config_name: str, *, check: Task) -> Callable[[Task], Callable[[
             keep_pages()
             quiet_libraries()
             try:
-                precheck(config_name, sys.argv[1:], check)
+                precheck(config_name, sys.argv[1:], check, check_folder)
+                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
             except UserInputError as error:
                 fail(error)
-            hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
+            except KeyboardInterrupt:
+                print("rcdsac_trl: interrupted", file=sys.stderr)
+                raise SystemExit(INTERRUPTED) from None
 
         return main
 
@@ -60,12 +72,29 @@ def fail(error: UserInputError) -> NoReturn:
     raise SystemExit(2)
 
 
-def precheck(config_name: str, argv: list[str], check: Task) -> None:
-    """Compose and check the config without writing anything; multirun and Hydra's own flags are left to Hydra."""
+def precheck(
+    config_name: str, argv: list[str], check: Task, check_folder: Callable[[Path], None] | None = None
+) -> None:
+    """Compose and check the config, in a multirun that of every job, without writing anything.
+
+    Calls that only show something (``--help``, ``--cfg``, ..) are left to Hydra.
+    """
     args = get_args_parser().parse_args(argv)
-    if args.multirun or args.help or args.hydra_help or args.cfg or args.info:
+    if args.help or args.hydra_help or args.cfg or args.info:
         return
-    check(compose(config_name, args.overrides))
+    for overrides in _jobs(args.overrides) if args.multirun else [args.overrides]:
+        check(compose(config_name, overrides))
+    if check_folder is not None and not args.multirun:
+        check_folder(Path(_compose(config_name, args.overrides, return_hydra_config=True).hydra.run.dir))
+
+
+def _jobs(overrides: list[str]) -> list[list[str]]:
+    """Split the overrides of a multirun as Hydra's own sweeper does."""
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except HydraException as error:
+        raise UserInputError(" ".join(str(error).split())) from error
+    return [job for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
 
 
 def compose(config_name: str, overrides: list[str]) -> DictConfig:
@@ -74,13 +103,20 @@ def compose(config_name: str, overrides: list[str]) -> DictConfig:
     Raises:
         UserInputError: one sentence for whatever Hydra refuses.
     """
+    cfg = _compose(config_name, overrides)
+    try:
+        OmegaConf.to_container(cfg, resolve=True)
+    except OmegaConfBaseException as error:
+        raise UserInputError(" ".join(str(error).split())) from error
+    return cfg
+
+
+def _compose(config_name: str, overrides: list[str], *, return_hydra_config: bool = False) -> DictConfig:
     # Inside a Hydra main the search path is set up already, and setting it up twice is an error.
     inside = GlobalHydra.instance().is_initialized()
     with nullcontext() if inside else hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         try:
-            cfg = hydra.compose(config_name, overrides=overrides)
-            OmegaConf.to_container(cfg, resolve=True)
-            return cfg
+            return hydra.compose(config_name, overrides=overrides, return_hydra_config=return_hydra_config)
         except (HydraException, OmegaConfBaseException) as error:
             raise UserInputError(_sentence(error, config_name, overrides)) from error
 
@@ -95,11 +131,10 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']+)'", text):
         group, name = match.groups()
         return f"{group}={name} does not exist: choose one of {', '.join(choices(group))}"
-    if any(override.startswith("algo=") for override in overrides):
+    if config_name == "train" and any(override.startswith("algo=") for override in overrides):
         return f"write +algo=<name> (with a plus): one of {', '.join(choices('algo'))}"
     if match := re.search(r"Key '([^']+)' is not in struct\s+full_key: (\S+)", text):
-        close = difflib.get_close_matches(match[2], _all_keys(config_name, overrides), n=1, cutoff=0.5)
-        return f"there is no key {match[2]}" + (f": did you mean {close[0]}?" if close else "")
+        return unknown_key(match[2], _all_keys(config_name, overrides))
     return " ".join(text.split())
 
 

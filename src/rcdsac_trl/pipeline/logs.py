@@ -53,14 +53,19 @@ def commit() -> str:
     return described.stdout.strip() if tracked.returncode == 0 else "none"
 
 
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that already holds a run."""
+    if (folder / CONFIG_NAME).exists():
+        raise UserInputError(f"{folder} already holds a run: choose another hydra.run.dir")
+
+
 def start_run_folder(folder: Path, cfg: DictConfig, facts: Mapping[str, object]) -> None:
     """Write what a run is made of: the resolved config, versions, commit and command.
 
     Raises:
         UserInputError: if the folder already holds a run.
     """
-    if (folder / CONFIG_NAME).exists():
-        raise UserInputError(f"{folder} already holds a run: choose another hydra.run.dir")
+    check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(cfg, folder / CONFIG_NAME, resolve=True)
     manifest = {

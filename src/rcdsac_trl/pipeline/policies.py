@@ -74,6 +74,7 @@ class CollectionPolicy(TensorDictModuleBase):
 
     def _next_noise(self, action: Tensor, is_init: Tensor) -> Tensor:
         fresh = torch.empty(action.shape, device=self.generator.device).normal_(generator=self.generator)
+        fresh = fresh.to(action.device)
         kept = PERSISTENCE * self._noise + (1 - PERSISTENCE**2) ** 0.5 * fresh
         self._noise = torch.where(is_init, fresh, kept)
         return self._noise

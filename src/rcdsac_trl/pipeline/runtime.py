@@ -4,6 +4,7 @@ This module is imported before torch, so that a re-executed process has paid not
 """
 
 import os
+import re
 import sys
 
 from rcdsac_trl.errors import UserInputError
@@ -52,22 +53,30 @@ def resolve_device(name: str) -> str:
 
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise UserInputError(f"device={name} is no device of torch: use auto, cpu or cuda") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserInputError(f"device={name}, but torch sees no CUDA here: use device=auto or device=cpu")
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+        raise UserInputError(f"device={name} is not supported: use auto, cpu, cuda or cuda:<number>")
+    if name != "cpu" and (torch.device(name).index or 0) >= torch.cuda.device_count():
+        raise UserInputError(f"device={name}, but torch does not see it here: use device=auto or device=cpu")
     return name
 
 
-def set_threads(threads: int | str) -> int:
-    """Set how many threads torch uses for one operation; ``auto`` takes the cores this process may use."""
-    import torch
+def resolve_threads(threads: int | str) -> int:
+    """Turn ``auto`` into the cores this process may use.
 
+    Raises:
+        UserInputError: if there is no such number of threads.
+    """
     if threads == "auto":
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not isinstance(threads, int) or threads < 1:
         raise UserInputError(f"threads={threads} is not a whole number of at least 1: use that or auto")
-    torch.set_num_threads(threads)
     return threads
+
+
+def set_threads(threads: int | str) -> int:
+    """Set how many threads torch uses for one operation, see :func:`resolve_threads`, and return the number."""
+    import torch
+
+    number = resolve_threads(threads)
+    torch.set_num_threads(number)
+    return number

@@ -1,5 +1,6 @@
 """What a run may choose, checked: each class mirrors one section of ``conf/train.yaml``, which explains it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
@@ -129,7 +130,7 @@ class AlgoSettings:
             return [Condition(collision_weight=weight) for weight in self.evaluation_collision_weights]
         return [Condition(beta=self.beta)]
 
-    def conditions(self, betas: list[float] | None, weights: list[float] | None) -> list[Condition]:
+    def conditions(self, betas: Sequence[float] | None, weights: Sequence[float] | None) -> list[Condition]:
         """Turn what a user asks of an evaluation into conditions.
 
         Raises:
@@ -164,6 +165,7 @@ class WorldSettings:
     sensor: str
     num_agents: int
     num_workers: int | Literal["auto"]
+    gui: bool = False
 
     def __post_init__(self) -> None:
         """Refuse an unknown sensor and agents that the workers cannot share."""

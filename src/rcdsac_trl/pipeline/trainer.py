@@ -140,7 +140,8 @@ class Trainer:
                 self._save(iteration)
                 raise
             finally:
-                self.collector.shutdown()
+                # A shell's Ctrl-C may have ended the workers already: closing must not hide why training ends.
+                self.collector.shutdown(raise_on_error=False)
                 self.log.close()
 
     def _episodes(self) -> Iterator[TensorDictBase]:

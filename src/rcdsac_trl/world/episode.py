@@ -25,7 +25,7 @@ from rcdsac_trl.world.planner import Planner
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.shapes import Map
 from rcdsac_trl.world.simulation import Simulation
-from rcdsac_trl.world.spaces import ACTION_SIZE, Buffers
+from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES, Buffers
 from rcdsac_trl.world.task import TaskSettings
 
 Pose = tuple[float, float, float]
@@ -117,9 +117,7 @@ class NavigationAgent:
         # The step is paid for progress to the waypoint that was next while it was taken.
         _, bearing = rules.distance_and_bearing(self.pose, self._path[self._next])
         self.goal_reached = self._distance_to(self._goal) < task.goal_radius_m
-        components = rules.reward_components(
-            moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached
-        )
+        components = rules.reward_components(moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached)
         if self.goal_reached:
             self._draw_goal()
         else:
@@ -156,9 +154,7 @@ class NavigationAgent:
 
     def _require_simulation(self) -> Simulation:
         if self._simulation is None:
-            raise UserInputError(
-                "the environment was stepped or drawn before its first reset; call reset() first"
-            )
+            raise UserInputError("the environment was stepped or drawn before its first reset; call reset() first")
         return self._simulation
 
     def _stream(self, purpose: str, *index: int) -> np.random.Generator:
@@ -186,9 +182,7 @@ class NavigationAgent:
         self._trail.append(self.pose[:2])
         task = self._task
         distances = self._require_simulation().scan()
-        self.distances_m = rules.noisy_ranges(
-            distances, task.range_noise_std_m, task.range_dropout, self._noise
-        )
+        self.distances_m = rules.noisy_ranges(distances, task.range_noise_std_m, task.range_dropout, self._noise)
 
 
 class AgentGroup:
@@ -297,10 +291,7 @@ class AgentGroup:
 
     def _checked(self, actions: NDArray) -> list[list[float]]:
         # The comparison is false for NaN too.
-        if (
-            actions.shape != (len(self), ACTION_SIZE)
-            or not (np.abs(actions) <= 1.0 + _ACTION_TOLERANCE).all()
-        ):
+        if actions.shape != (len(self), ACTION_SIZE) or not (np.abs(actions) <= 1.0 + _ACTION_TOLERANCE).all():
             raise UserInputError(
                 f"actions {actions.tolist()} must be {ACTION_SIZE} numbers in [-1, 1] for each of "
                 f"{len(self)} agents; look for NaN in the policy, or scale its output"
@@ -318,8 +309,11 @@ class AgentGroup:
         self._distances[row] = agent.distances_m
 
     def _see(self) -> None:
-        """Write the range observations of all agents at once, which costs little more than one agent's."""
-        self.buffers.range[:] = rules.range_observation(self._distances, self._mask)
+        """Write what is cheaper for all agents at once than for each: ranges, and the limits of velocities."""
+        buffers = self.buffers
+        buffers.range[:] = rules.range_observation(self._distances, self._mask)
+        limits = SPACES["velocity"]
+        np.clip(buffers.velocity, limits.low, limits.high, out=buffers.velocity)
 
 
 def _not_negative(name: str, value: int) -> int:

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.episode import AgentGroup
 from rcdsac_trl.world.maps import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
@@ -60,6 +61,8 @@ class NavigationGymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         gui: bool = False,
         render_mode: str | None = None,
     ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UserInputError(f"render_mode={render_mode!r} does not exist; use 'rgb_array' or None")
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
             {key: _box(key) for key in AGENT_OBSERVATIONS}
         )
@@ -123,5 +126,10 @@ def _box(key: str) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(space.low, space.high, dtype=np.float32)
 
 
-if ENV_ID not in gymnasium.registry:
-    gymnasium.register(ENV_ID, entry_point=f"{__name__}:NavigationGymEnv")
+def register() -> None:
+    """Register :data:`ENV_ID` with Gymnasium; harmless when done before."""
+    if ENV_ID not in gymnasium.registry:
+        gymnasium.register(ENV_ID, entry_point=f"{__name__}:NavigationGymEnv")
+
+
+register()

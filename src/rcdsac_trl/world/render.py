@@ -167,9 +167,7 @@ class _Canvas:
         lines = (self._top - points[:, 1]) * self._scale
         return list(zip(columns.tolist(), lines.tolist(), strict=True))
 
-    def polygon(
-        self, points: np.ndarray, fill: Color, edge: Color | None = None, edge_m: float = 0.0
-    ) -> None:
+    def polygon(self, points: np.ndarray, fill: Color, edge: Color | None = None, edge_m: float = 0.0) -> None:
         corners = self.pixels(points)
         self._draw.polygon(corners, fill)
         if edge is not None:

@@ -11,10 +11,10 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.world.bullet import pybullet
 from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import Box, Cylinder, Map

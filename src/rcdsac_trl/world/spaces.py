@@ -48,6 +48,8 @@ def _unlimited(size: int) -> Space:
 
 
 _FLAG = Space(np.zeros(1, np.float32), np.ones(1, np.float32), np.bool_)
+# Velocities are measured after contacts, in which a mover can push; 10 m/s and 10 rad/s are far beyond that.
+_FASTEST = 10.0
 _LOG_NEAR, _LOG_FAR = (math.log10(limit) for limit in task.WAYPOINT_DISTANCE_LIMITS_M)
 
 ACTION_SIZE = 2
@@ -58,7 +60,7 @@ AGENT_OBSERVATIONS = ("range", "waypoint", "velocity")
 SPACES: dict[str, Space] = {
     "range": _numbers([0.0] * NUM_BINS, [task.RANGE_OFFSET + math.log10(MAX_RANGE_M)] * NUM_BINS),
     "waypoint": _numbers([_LOG_NEAR, -1.0, -1.0] * 2, [_LOG_FAR, 1.0, 1.0] * 2),
-    "velocity": _unlimited(4),  # measured after contacts, which can push the robot
+    "velocity": _numbers([-_FASTEST] * 4, [_FASTEST] * 4),
     "pose": _unlimited(3),
     "contact": _FLAG,
     "goal_reached": _FLAG,

@@ -1,0 +1,83 @@
+"""Networks, their loss and what updates them."""
+
+import torch
+from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
+
+from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic, build_policy
+from rcdsac_trl.agent.losses import DistributionalSACLoss
+from rcdsac_trl.agent.transforms import Relabel
+from rcdsac_trl.pipeline.policies import OnDevice
+from rcdsac_trl.pipeline.run_settings import TrainingSettings
+from rcdsac_trl.pipeline.settings import LearnerSettings
+from rcdsac_trl.seeding import torch_seed, torch_stream
+
+
+def make_loss(settings: TrainingSettings, device: str) -> LossModule:
+    """Make actor, critics and their loss, with weights from the stream ``"weights"``."""
+    algo, learner, widths = settings.algo, settings.learner, settings.network
+    vectors = dict(OBSERVATIONS)
+    if algo.collision_weight is not None:
+        vectors["collision_weight"] = 1
+    # Layers draw their first weights from torch's global generator: lend it our stream, and give it back.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(torch_seed(settings.seed, "weights"))
+        actor = build_actor(2, vectors, algo.network_measure, widths)
+        critics = [
+            build_critic(2, vectors, algo.critic, algo.network_measure, widths) for _ in range(learner.num_critics)
+        ]
+    loss = DistributionalSACLoss(
+        actor.to(device),
+        [critic.to(device) for critic in critics],
+        measure=algo.distortion.measure,
+        num_quantiles=learner.num_quantiles,
+        num_target_quantiles=learner.num_target_quantiles,
+        num_risk_samples=learner.num_risk_samples,
+        fractions_per=learner.fractions_per,
+        kappa=learner.kappa,
+        alpha_init=learner.alpha_init,
+        target_entropy=learner.target_entropy,
+        burn_in=learner.burn_in,
+        generator=torch_stream(settings.seed, "loss", device=device),
+    ).to(device)
+    loss.make_value_estimator(gamma=learner.gamma)
+    return loss
+
+
+def make_policy(loss: LossModule, env: EnvBase, generator: torch.Generator, device: str) -> TensorDictModuleBase:
+    """Make the acting policy; it shares the weights of the loss's actor."""
+    policy = build_policy(loss.actor_network, env.action_spec_unbatched, generator=generator)
+    return policy if device == "cpu" else OnDevice(policy, device)
+
+
+def make_optimizer(loss: LossModule, learner: LearnerSettings) -> torch.optim.Optimizer:
+    """Make one Adam with a learning rate for each of the three losses."""
+    groups = [
+        {"params": parameters(loss.actor_network_params), "lr": learner.actor_lr},
+        {"params": parameters(loss.critic_network_params), "lr": learner.critic_lr},
+        {"params": [loss.log_alpha], "lr": learner.alpha_lr},
+    ]
+    return torch.optim.Adam(groups, fused=True)
+
+
+def parameters(params: TensorDictParams) -> list[torch.nn.Parameter]:
+    """List the parameters of one network of a loss."""
+    return [p for p in params.values(True, True) if isinstance(p, torch.nn.Parameter)]
+
+
+def make_relabel(settings: TrainingSettings, device: str) -> Relabel | None:
+    """Make what sets the beta of a batch; None where losses read no beta."""
+    algo = settings.algo
+    if algo.critic == "scalar":
+        return None
+    fixed = None
+    if algo.conditioning != "per_episode":
+        fixed = algo.beta if algo.beta is not None else algo.distortion.measure.neutral_beta
+    return Relabel(
+        algo.distortion.measure,
+        mode="fixed" if fixed is not None else algo.relabel,
+        per=settings.learner.resample_per,
+        beta=fixed,
+        generator=torch_stream(settings.seed, "relabel", device=device),
+    )

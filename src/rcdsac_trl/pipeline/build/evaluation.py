@@ -1,0 +1,116 @@
+"""An evaluation from its config."""
+
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import pandas as pd
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline import logs, runtime
+from rcdsac_trl.pipeline.build.agent import make_loss, make_policy
+from rcdsac_trl.pipeline.build.read import evaluation_settings, settings_of_run, training_settings
+from rcdsac_trl.pipeline.build.world import evaluation_environment
+from rcdsac_trl.pipeline.checkpoint import load_manifest, load_weights
+from rcdsac_trl.pipeline.cli import compose
+from rcdsac_trl.pipeline.evaluation import EvaluationRun, evaluate
+from rcdsac_trl.pipeline.metrics import Condition
+from rcdsac_trl.pipeline.policies import PursuitPolicy
+from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
+from rcdsac_trl.pipeline.settings import WorldSettings
+from rcdsac_trl.seeding import torch_stream
+
+
+def evaluation(cfg: DictConfig) -> EvaluationRun:
+    """Make an evaluation of a run or a baseline; refuses before anything is written.
+
+    Raises:
+        UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit.
+    """
+    settings = evaluation_settings(cfg)
+    trained = _trained(settings)
+    algo = trained.algo if settings.run is not None else None
+    conditions = [Condition()] if algo is None else algo.conditions(settings.beta, settings.collision_weight)
+    world = _evaluation_world(settings, trained, len(conditions))
+    device = runtime.resolve_device(settings.device)
+    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
+    if settings.run is not None:
+        checkpoints = Path(settings.run) / "checkpoints"
+        load_manifest(checkpoints, settings.checkpoint)
+        default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}"
+    else:
+        default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
+
+    def rows(on_map: Callable[[int], None]) -> pd.DataFrame:
+        runtime.set_threads(settings.threads)
+        env = evaluation_environment(
+            world, algo, conditions, settings.split, settings.seed, settings.num_episodes, trained.network.memory
+        )
+        if algo is None:
+            policy: TensorDictModuleBase = PursuitPolicy()
+        else:
+            loss = make_loss(trained, device)
+            load_weights(checkpoints, settings.checkpoint, loss)
+            generator = torch_stream(settings.seed, "evaluation actions", device=device)
+            policy = make_policy(loss, env, generator, device)
+        try:
+            return evaluate(
+                env,
+                policy,
+                conditions=conditions,
+                num_agents=settings.num_episodes,
+                num_maps=settings.num_maps,
+                steps=world.task.episode_steps,
+                sampled=settings.sampled,
+                on_map=on_map,
+            )
+        finally:
+            env.close()
+
+    described = {
+        "agent": settings.baseline if algo is None else algo.name,
+        "measure": None if algo is None else algo.distortion.name,
+        "sensor": world.sensor,
+        "checkpoint": None if algo is None else settings.checkpoint,
+        "split": settings.split,
+        "seed": settings.seed,
+        "num_maps": settings.num_maps,
+        "num_episodes": settings.num_episodes,
+        "sampled": settings.sampled,
+        "conditions": [str(condition) for condition in conditions],
+        "map": asdict(world.map_settings),
+        "task": asdict(world.task),
+        "commit": logs.commit(),
+    }
+    return EvaluationRun(
+        out=Path(settings.out) if settings.out is not None else default_out,
+        described=described,
+        num_maps=settings.num_maps,
+        rows=rows,
+    )
+
+
+def _trained(settings: EvaluationSettings) -> TrainingSettings:
+    if settings.run is not None:
+        return settings_of_run(Path(settings.run))
+    # A baseline drives in training's default world; which agent would be trained there does not matter.
+    return training_settings(compose("train", ["+algo=sac"]))
+
+
+def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, num_conditions: int) -> WorldSettings:
+    sensor = settings.sensor or trained.sensor
+    if settings.run is not None and sensor != trained.sensor:
+        raise UserInputError(
+            f"sensor={sensor.name} does not fit: {settings.run} was trained with sensor={trained.sensor.name}, "
+            "leave it out"
+        )
+    return WorldSettings(
+        map_settings=settings.map or trained.map,
+        task=settings.task or trained.task,
+        sensor=sensor.name,
+        num_agents=settings.num_episodes * num_conditions,
+        num_workers=0 if settings.gui else settings.num_workers,
+        gui=settings.gui,
+    )

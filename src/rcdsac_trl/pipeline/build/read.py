@@ -1,0 +1,58 @@
+"""The config as checked settings: the only module that knows how a config is laid out."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline.cli import choices
+from rcdsac_trl.pipeline.logs import CONFIG_NAME
+from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
+from rcdsac_trl.pipeline.typed import read
+
+
+def training_settings(cfg: DictConfig) -> TrainingSettings:
+    """Read the config of a training.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work; without an algorithm, a sentence lists the choices.
+    """
+    values = _plain(cfg)
+    if values.get("algo") is None:
+        raise UserInputError(f"no algorithm chosen: add +algo=<name>, one of {', '.join(choices('algo'))}")
+    return read(TrainingSettings, values)
+
+
+def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
+    """Read the config of an evaluation.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(EvaluationSettings, _plain(cfg))
+
+
+def settings_of_run(folder: Path) -> TrainingSettings:
+    """Read what a run was trained with.
+
+    Raises:
+        UserInputError: if the folder holds no run, or one that this version cannot read.
+    """
+    path = folder / CONFIG_NAME
+    if not path.is_file():
+        raise UserInputError(f"run={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
+    try:
+        cfg = OmegaConf.load(path)
+        if not isinstance(cfg, DictConfig):
+            raise UserInputError("it holds no keys")
+        return training_settings(cfg)
+    except (OSError, yaml.YAMLError, OmegaConfBaseException, UserInputError) as error:
+        reason = " ".join(str(error).split())
+        raise UserInputError(f"{path} cannot be read ({reason}): name a folder that this version wrote") from error
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(cfg, resolve=True)  # type: ignore[return-value]

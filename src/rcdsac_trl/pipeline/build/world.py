@@ -1,0 +1,104 @@
+"""Environments with everything a policy reads."""
+
+from collections.abc import Callable, Sequence
+
+from torchrl.envs import EnvBase, InitTracker, StepCounter, TransformedEnv
+
+from rcdsac_trl.agent.actor import recurrent_state_primer
+from rcdsac_trl.agent.transforms import EpisodeSampler
+from rcdsac_trl.pipeline.metrics import Condition
+from rcdsac_trl.pipeline.settings import AlgoSettings, WorldSettings
+from rcdsac_trl.world.env import make_env
+from rcdsac_trl.world.maps import Split
+
+
+def environment(
+    world: WorldSettings,
+    algo: AlgoSettings | None,
+    *,
+    split: Split,
+    seed: int,
+    agent_ids: Sequence[int],
+    memory: int,
+    conditions: Sequence[Condition] | None = None,
+    range_fraction: Callable[[int], float] = lambda episode: 1.0,
+) -> EnvBase:
+    """Make an environment with everything a policy reads.
+
+    Args:
+        world: what it is made of.
+        algo: what the agents are told; None for a baseline, which is told nothing.
+        split: training, validation or evaluation maps.
+        seed: root seed of maps, starts, goals, movers and of what the agents are told.
+        agent_ids: numbers of the agents; equal numbers meet the same starts and goals.
+        memory: size of the policy's recurrent state.
+        conditions: tell agent i ``conditions[i]``; None draws what they are told an episode.
+        range_fraction: how much of beta's range is open in an episode.
+    """
+    weighted = algo is not None and algo.collision_weight is not None
+    base = make_env(
+        world.map_settings,
+        world.task,
+        sensor=world.sensor,
+        split=split,
+        seed=seed,
+        agent_ids=agent_ids,
+        num_workers=world.num_workers,
+        weighted_collisions=weighted,
+        gui=world.gui,
+    )
+    env = TransformedEnv(base)
+    env.append_transform(InitTracker())
+    env.append_transform(StepCounter(max_steps=world.task.episode_steps))
+    env.append_transform(recurrent_state_primer(memory))
+    if algo is not None and algo.context_key is not None:
+        env.append_transform(_told(algo, seed, agent_ids, conditions, range_fraction))
+    return env
+
+
+def _told(
+    algo: AlgoSettings,
+    seed: int,
+    agent_ids: Sequence[int],
+    conditions: Sequence[Condition] | None,
+    range_fraction: Callable[[int], float],
+) -> EpisodeSampler:
+    fixed: list[float] | None = None
+    if algo.collision_weight is not None:
+        low, high = algo.collision_weight
+        if conditions is not None:
+            fixed = [c.collision_weight for c in conditions if c.collision_weight is not None]
+        return EpisodeSampler(
+            "collision_weight", lambda u, episode: low + (high - low) * u, seed=seed, agent_ids=agent_ids, fixed=fixed
+        )
+    measure = algo.distortion.measure
+    if conditions is not None:
+        fixed = [c.beta for c in conditions if c.beta is not None]
+    return EpisodeSampler(
+        "risk",
+        lambda u, episode: measure.widen(measure.from_uniform(u), range_fraction(episode)),
+        seed=seed,
+        agent_ids=agent_ids,
+        fixed=fixed,
+    )
+
+
+def evaluation_environment(
+    world: WorldSettings,
+    algo: AlgoSettings | None,
+    conditions: Sequence[Condition],
+    split: Split,
+    seed: int,
+    num_agents: int,
+    memory: int,
+) -> EnvBase:
+    """Make an environment in which a block of agents drives under each condition, side by side on the same map."""
+    return environment(
+        world,
+        algo,
+        split=split,
+        seed=seed,
+        agent_ids=list(range(num_agents)) * len(conditions),
+        memory=memory,
+        conditions=[condition for condition in conditions for _ in range(num_agents)],
+    )

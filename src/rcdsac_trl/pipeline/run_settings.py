@@ -1,0 +1,167 @@
+"""All that a training or an evaluation may choose, checked as a whole.
+
+The two outermost classes are the roots of ``conf/train.yaml`` and ``conf/evaluate.yaml``.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.pipeline.settings import AlgoSettings, LearnerSettings, Schedule, WorldSettings
+from rcdsac_trl.world.maps import MapSettings
+from rcdsac_trl.world.task import TaskSettings
+
+Threads = int | Literal["auto"]
+Workers = int | Literal["auto"]
+
+
+def _check_least(key: str, value: int, lowest: int) -> None:
+    if value < lowest:
+        raise UserInputError(f"{key}={value} must be at least {lowest}")
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """Which bins of the range sensor are seen (``conf/sensor``); :class:`WorldSettings` knows the names."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class LoggerSettings:
+    """Where scalars go (``conf/logger``); a training checks the names, an evaluation of it need not have them."""
+
+    backends: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TeamSettings:
+    """The agents that drive side by side; :class:`WorldSettings` checks that the workers can share them."""
+
+    num_agents: int
+    num_workers: Workers
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """The replay's size."""
+
+    capacity_steps: int
+
+
+@dataclass(frozen=True)
+class ValidationSettings:
+    """When and how long training looks at its agent."""
+
+    every_iterations: int
+    num_maps: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is below 1."""
+        _check_least("validation.every_iterations", self.every_iterations, 1)
+        _check_least("validation.num_maps", self.num_maps, 1)
+
+
+@dataclass(frozen=True)
+class CheckpointSettings:
+    """When training saves its agent."""
+
+    every_iterations: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is below 1."""
+        _check_least("checkpoint.every_iterations", self.every_iterations, 1)
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """The root of ``conf/train.yaml``; every section is checked by its own class, here what spans several."""
+
+    algo: AlgoSettings
+    sensor: SensorSettings
+    map: MapSettings
+    task: TaskSettings
+    logger: LoggerSettings
+    seed: int
+    device: str
+    threads: Threads
+    world: TeamSettings
+    network: Widths
+    learner: LearnerSettings
+    replay: ReplaySettings
+    schedule: Schedule
+    validation: ValidationSettings
+    checkpoint: CheckpointSettings
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together, or not this machine."""
+        _check_least("seed", self.seed, 0)
+        runtime.resolve_threads(self.threads)
+        if self.schedule.range_fraction(0) < 1 and self.algo.conditioning == "per_episode":
+            self.algo.distortion.measure.widen(0.0, 0.0)  # refuses a measure without a neutral beta
+        episode_steps, sequence_length = self.task.episode_steps, self.learner.sequence_length
+        if sequence_length > episode_steps:
+            raise UserInputError(
+                f"learner.sequence_length={sequence_length} is longer than an episode of "
+                f"task.episode_steps={episode_steps} transitions: shorten it"
+            )
+        iteration_steps = self.training_world.num_agents * episode_steps
+        if self.replay.capacity_steps < iteration_steps:
+            raise UserInputError(
+                f"replay.capacity_steps={self.replay.capacity_steps} does not hold the {iteration_steps} steps of one "
+                "iteration (world.num_agents x task.episode_steps): raise it"
+            )
+
+    @property
+    def training_world(self) -> WorldSettings:
+        """What the training environment is made of."""
+        return WorldSettings(
+            map_settings=self.map,
+            task=self.task,
+            sensor=self.sensor.name,
+            num_agents=self.world.num_agents,
+            num_workers=self.world.num_workers,
+        )
+
+    @property
+    def replay_steps(self) -> int:
+        """Steps that the replay is made for: no more than the run can fill."""
+        steps = self.schedule.iterations * self.world.num_agents * self.task.episode_steps
+        return min(self.replay.capacity_steps, steps)
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """The root of ``conf/evaluate.yaml``."""
+
+    run: str | None
+    beta: tuple[float, ...] | None
+    collision_weight: tuple[float, ...] | None
+    checkpoint: Literal["best", "last"]
+    baseline: Literal["pursuit"] | None
+    split: Literal["evaluation", "validation"]
+    seed: int
+    num_maps: int
+    num_episodes: int
+    sampled: bool
+    out: str | None
+    num_workers: Workers
+    gui: bool
+    device: str
+    threads: Threads
+    map: MapSettings | None = None
+    sensor: SensorSettings | None = None
+    task: TaskSettings | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit, and neither or both of run and baseline."""
+        if (self.run is None) == (self.baseline is None):
+            raise UserInputError("name what to evaluate: either run=<folder> or baseline=pursuit")
+        if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
+            raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
+        _check_least("seed", self.seed, 0)
+        _check_least("num_maps", self.num_maps, 1)
+        _check_least("num_episodes", self.num_episodes, 1)
+        runtime.resolve_threads(self.threads)

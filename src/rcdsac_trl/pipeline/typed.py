@@ -1,0 +1,100 @@
+"""Plain values, as YAML and a command line bring them, into settings: every key known, every type right."""
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from rcdsac_trl.errors import UserInputError
+
+Settings = TypeVar("Settings")
+
+_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
+
+
+def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> Settings:
+    """Make a settings dataclass of a section whose keys are its fields; a field may be a section of its own.
+
+    Understood are ``bool``, ``int``, ``float`` (which takes whole numbers, and nothing infinite), ``str``,
+    ``Literal``, ``None``, tuples (from lists), dataclasses (from sections) and unions of these.
+
+    Args:
+        cls: a dataclass.
+        values: the section.
+        section: where it lies, for messages; ``""`` is the root.
+
+    Raises:
+        UserInputError: for an unknown or missing key, a value of another type, and what the dataclass refuses.
+
+    Example:
+        >>> @dataclass
+        ... class Lens:
+        ...     focus_m: float
+        >>> read(Lens, {"focus_m": "near"}, "lens")
+        Traceback (most recent call last):
+        rcdsac_trl.errors.UserInputError: lens.focus_m=near must be a number
+    """
+    hints = get_type_hints(cls)
+    known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
+    for key in values:
+        if key not in known:
+            raise UserInputError(unknown_key(_join(section, str(key)), [_join(section, name) for name in known]))
+    missing = [name for name, field in known.items() if name not in values and _is_required(field)]
+    if missing:
+        raise UserInputError(f"{_join(section, missing[0])} is missing: give it a value")
+    return cls(**{key: _fit(value, hints[key], _join(section, key)) for key, value in values.items()})
+
+
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """Say that a key does not exist, and which one may have been meant."""
+    close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
+    return f"there is no key {key}" + (f": did you mean {close[0]}?" if close else "")
+
+
+def _join(section: str, key: str) -> str:
+    return f"{section}.{key}" if section else key
+
+
+def _is_required(field: Field) -> bool:
+    return field.default is MISSING and field.default_factory is MISSING
+
+
+def _fit(value: Any, hint: Any, path: str) -> Any:
+    options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    for option in options:
+        if is_dataclass(option) and isinstance(option, type):
+            if isinstance(value, Mapping):
+                return read(option, value, path)
+        elif _is_a(value, option):
+            return tuple(value) if isinstance(value, list) else value
+    wanted = " or ".join(_describe(option) for option in options)
+    shown = "null" if value is None else value
+    raise UserInputError(f"{path}={shown} must be {wanted}")
+
+
+def _is_a(value: Any, hint: Any) -> bool:
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return value in args
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            return False
+        each = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+        return len(value) == len(each) and all(_is_a(v, h) for v, h in zip(value, each, strict=True))
+    if isinstance(value, bool):  # Python counts it as a number
+        return hint is bool
+    if hint is float:
+        return isinstance(value, int | float) and math.isfinite(value)
+    return isinstance(value, hint)
+
+
+def _describe(hint: Any) -> str:
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return ("one of " if len(args) > 1 else "") + ", ".join(str(arg) for arg in args)
+    if origin is tuple:
+        length = "a list" if args[-1] is Ellipsis else f"a list of {len(args)}"
+        return f"{length}, each {_describe(args[0])}"
+    return _NAMES.get(hint, "a section with keys of its own")

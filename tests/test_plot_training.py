@@ -1,0 +1,109 @@
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline.cli import compose
+from rcdsac_trl.pipeline.metrics import METRICS
+from rcdsac_trl.plot_training import PANELS, best_updates, check, draw_run, learning_curve, validation_curves
+
+NAN = float("nan")
+
+
+def validation(beta: float, collision_weight: float, rewards: dict[int, list[float]]) -> pd.DataFrame:
+    rows = [
+        dict.fromkeys(METRICS, 0.5)
+        | {"updates": updates, "beta": beta, "collision_weight": collision_weight, "reward": reward}
+        for updates, values in rewards.items()
+        for reward in values
+    ]
+    return pd.DataFrame(rows)
+
+
+TWO_BETAS = pd.concat(
+    [
+        validation(-0.5, NAN, {100: [10.0, 20.0], 200: [30.0, 50.0], 300: [50.0, 60.0]}),
+        validation(-2.0, NAN, {100: [0.0, 4.0], 200: [90.0, 110.0], 300: [20.0, 30.0]}),
+    ]
+)
+TRAINING = TWO_BETAS.drop(columns=["beta", "collision_weight"])
+
+
+def test_every_metric_has_a_panel() -> None:
+    assert set(PANELS) == set(METRICS)
+
+
+def test_curves_are_the_means_of_a_condition_in_ascending_order() -> None:
+    averse, bold = validation_curves(TWO_BETAS)
+    assert (averse.label, bold.label) == ("validation, β = -2", "validation, β = -0.5")
+    assert averse.means["reward"].to_dict() == {100: 2.0, 200: 100.0, 300: 25.0}
+    assert bold.means["reward"].to_dict() == {100: 15.0, 200: 40.0, 300: 55.0}
+    assert averse.color != bold.color
+    assert averse.marker != bold.marker
+
+
+def test_rows_without_beta_have_their_own_labels() -> None:
+    weights = pd.concat([validation(NAN, weight, {1: [0.0]}) for weight in (1.0, 1.5, 2.0)])
+    assert [c.label for c in validation_curves(weights)] == [f"validation, w_coll = {w}" for w in ("1", "1.5", "2")]
+    assert [c.label for c in validation_curves(validation(NAN, NAN, {1: [0.0]}))] == ["validation"]
+
+
+def test_the_best_checkpoint_has_the_highest_mean_over_the_conditions() -> None:
+    # 8.5, 70 and 40 over both betas, however many episodes a beta has.
+    assert best_updates(TWO_BETAS) == 200
+    # Of equal scores the first stays, as in training.
+    assert best_updates(validation(-1.0, NAN, {5: [3.0], 9: [3.0]})) == 5
+
+
+@pytest.mark.parametrize(("table", "lines"), [(None, 1), (TWO_BETAS, 4)])  # training, two betas, the best checkpoint
+def test_every_panel_shows_every_curve(table: pd.DataFrame | None, lines: int) -> None:
+    figure = learning_curve("title", TRAINING, table)
+    *panels, legend = figure.axes
+    assert [axes.get_title(loc="left") for axes in panels] == list(PANELS.values())
+    assert {len(axes.get_lines()) for axes in panels} == {lines}
+    assert len(legend.get_legend().get_texts()) == lines
+
+
+def test_a_disastrous_iteration_does_not_flatten_the_reward() -> None:
+    steady = validation(NAN, NAN, {updates: [300.0, 302.0] for updates in range(1, 61)})
+    spoilt = steady.assign(reward=steady["reward"].where(steady["updates"] != 2, -1000.0))
+    low, high = learning_curve("title", spoilt, None).axes[0].get_ylim()
+    assert 290.0 < low < 301.0 < high < 310.0
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.yaml").write_text("algo: {name: sac}\nsensor: {name: full}\nseed: 3\n")
+    TRAINING.to_csv(folder / "training_episodes.csv", index=False)
+    return folder
+
+
+def test_draws_a_run_before_and_after_its_first_validation(run: Path) -> None:
+    draw_run(run, run / "before.png")
+    TWO_BETAS.to_csv(run / "validation_episodes.csv", index=False)
+    draw_run(run, run / "deeper" / "after.png")
+    pictures = []
+    for path in (run / "before.png", run / "deeper" / "after.png"):
+        with Image.open(path) as image:
+            pictures.append(np.asarray(image))
+    assert pictures[0].shape == pictures[1].shape
+    assert not np.array_equal(*pictures)
+
+
+def test_refuses_what_it_cannot_draw(run: Path, tmp_path: Path) -> None:
+    def refused(match: str, *overrides: str) -> None:
+        with pytest.raises(UserInputError, match=match):
+            check(compose("plot_training", list(overrides)))
+
+    check(compose("plot_training", [f"run={run}"]))
+    refused("name what to draw: run=<folder>")
+    refused(r"holds no config\.yaml: name a folder that training wrote", f"run={tmp_path}")
+    refused(r"out=.*picture\.jpg does not name a PNG file", f"run={run}", f"out={run}/picture.jpg")
+    (run / "training_episodes.csv").unlink()
+    refused(r"holds no training_episodes\.csv", f"run={run}")
+    assert [path.name for path in run.iterdir()] == ["config.yaml"]

@@ -1,0 +1,219 @@
+"""What holds the rooms apart, and the documents true: imports, the table of keys, the configuration."""
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
+
+import rcdsac_trl
+from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.risk import MEASURES
+from rcdsac_trl.paths import CONF_DIR
+from rcdsac_trl.pipeline.build.world import environment
+from rcdsac_trl.pipeline.settings import AlgoSettings, DistortionSettings, WorldSettings
+from rcdsac_trl.world.lidar import SENSORS
+from rcdsac_trl.world.maps import MapSettings
+from rcdsac_trl.world.task import TaskSettings
+
+SOURCE = Path(rcdsac_trl.__file__).parent
+
+
+# ------------------------------------------------------------------------------------------------ imports
+def imported_modules(path: Path) -> Iterator[str]:
+    """Yield every module a file imports, wherever in the file."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute, so that they can be read"
+            assert node.module is not None
+            yield node.module
+            # `from rcdsac_trl import pipeline` names a room as well.
+            yield from (f"{node.module}.{alias.name}" for alias in node.names if node.module == "rcdsac_trl")
+
+
+MODULES = sorted(path.relative_to(SOURCE).as_posix() for path in SOURCE.rglob("*.py"))
+
+
+def room_of(module: str) -> str:
+    """Name the room of a file or an import; what lies beside the rooms stands for itself."""
+    parts = module.removesuffix(".py").replace("/", ".").removeprefix("rcdsac_trl.").split(".")
+    return parts[0]
+
+
+# What each room, and each file beside them that serves all, may import of the package.
+ARROWS = {
+    "errors": set(),
+    "seeding": set(),
+    "paths": set(),
+    "world": {"errors", "seeding", "world"},
+    "agent": {"errors", "seeding", "agent"},
+    "pipeline": {"errors", "seeding", "paths", "world", "agent", "pipeline"},
+}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_arrows_go_down(module: str) -> None:
+    imported = set(imported_modules(SOURCE / module))
+    ours = {room_of(name) for name in imported if name.startswith("rcdsac_trl.")}
+    room = room_of(module)
+    if room in ARROWS:
+        assert ours <= ARROWS[room]
+    else:  # an entry point, which nothing else imports
+        assert ours <= {"errors", "seeding", "world", "agent", "pipeline", room}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_only_the_builders_read_the_config(module: str) -> None:
+    config_libraries = {name.split(".")[0] for name in imported_modules(SOURCE / module)} & {"hydra", "omegaconf"}
+    is_entry_point = "/" not in module
+    may = is_entry_point or module.startswith("pipeline/build/") or module in ("pipeline/cli.py", "pipeline/logs.py")
+    assert may or not config_libraries
+
+
+def test_the_rooms_are_there() -> None:
+    assert {room_of(module) for module in MODULES} >= ARROWS.keys()
+
+
+# ------------------------------------------------------------------------------------------------ the table of keys
+TYPES = {"f32": torch.float32, "i64": torch.int64, "bool": torch.bool}
+
+
+def key_table() -> dict[str, tuple[int, torch.dtype]]:
+    """Read key, size and type from the table in the package's docstring."""
+    assert rcdsac_trl.__doc__ is not None
+    table: dict[str, tuple[int, torch.dtype]] = {}
+    for line in rcdsac_trl.__doc__.splitlines():
+        if line.startswith("| `"):
+            keys, shape = (cell.strip() for cell in line.strip("|").split("|")[:2])
+            size, dtype = shape.split()
+            for key in re.findall(r"`(\w+)`", keys):
+                assert key not in table, f"{key} stands in the table twice"
+                table[key] = (int(size), TYPES[dtype])
+    return table
+
+
+def all_specs(env: EnvBase) -> dict[str, TensorSpec]:
+    composites = (env.full_observation_spec, env.full_reward_spec, env.full_done_spec, env.full_action_spec)
+    return {key: spec for composite in composites for key, spec in composite.items(True, True)}
+
+
+def row(name: str) -> AlgoSettings:
+    """Two rows that are told all there is to tell."""
+    weighted = name == "rcwr"
+    return AlgoSettings(
+        name=name,
+        critic="scalar" if weighted else "quantile",
+        conditioning="none" if weighted else "per_episode",
+        relabel="stored",
+        beta=None,
+        collision_weight=(0.1, 2.0) if weighted else None,
+        evaluation_collision_weights=(1.0,) if weighted else (),
+        distortion=DistortionSettings("neutral", 0.0, 0.0, ())
+        if weighted
+        else DistortionSettings("pow", -2.0, 0.0, ()),
+    )
+
+
+def test_the_table_of_keys_is_what_the_environment_has() -> None:
+    world = WorldSettings(MapSettings(size_m=10.0), TaskSettings(), sensor="narrow", num_agents=2, num_workers=0)
+    found: dict[str, tuple[int, torch.dtype]] = {}
+    for name in ("rcdsac_pow", "rcwr"):
+        env = environment(world, row(name), split="train", seed=0, agent_ids=range(2), memory=Widths().memory)
+        specs = all_specs(env)
+        assert {spec.shape[:-1] for spec in specs.values()} == {env.batch_size}
+        found |= {key: (spec.shape[-1], spec.dtype) for key, spec in specs.items()}
+        env.close()
+    assert key_table() == found
+
+
+# ------------------------------------------------------------------------------------------------ the configuration
+def conf(path: str) -> dict[str, Any]:
+    """Read one file of conf/ without Hydra's parts."""
+    values = yaml.safe_load((CONF_DIR / path).read_text()) or {}
+    return {key: value for key, value in values.items() if key not in ("defaults", "hydra")}
+
+
+def leaf_lines(node: yaml.Node, prefix: str) -> Iterator[tuple[str, int]]:
+    """Yield the full key and the line (from 0) of every value that is not a section."""
+    assert isinstance(node, yaml.MappingNode)
+    for key, value in node.value:
+        name = f"{prefix}.{key.value}".removeprefix(".")
+        if isinstance(value, yaml.MappingNode):
+            yield from leaf_lines(value, name)
+        else:
+            yield name, key.start_mark.line
+
+
+def keys_with_comments() -> Iterator[tuple[str, str, bool]]:
+    """Yield file, full key, and whether a comment stands right above the key."""
+    for path in sorted(CONF_DIR.rglob("*.yaml")):
+        text = path.read_text()
+        root = yaml.compose(text)
+        if root is None:
+            continue
+        name = path.relative_to(CONF_DIR).as_posix()
+        folder = path.parent.relative_to(CONF_DIR).as_posix().replace("/", ".").strip(".")
+        prefix = "" if "@package _global_" in text else folder
+        lines = text.splitlines()
+        for key, line in leaf_lines(root, prefix):
+            below_prefix = key.removeprefix(prefix).strip(".")
+            if below_prefix.split(".")[0] not in ("defaults", "hydra"):
+                yield name, key, line > 0 and lines[line - 1].strip().startswith("#")
+
+
+def test_every_key_of_the_configuration_is_explained() -> None:
+    entries = list(keys_with_comments())
+    explained = {key for _, key, commented in entries if commented}
+    # A preset or a row may change a value without repeating what the key means.
+    missing = [f"{name}: {key}" for name, key, commented in entries if not commented and key not in explained]
+    assert not missing
+    for root in ("train.yaml", "evaluate.yaml", "draw_maps.yaml", "plot_training.yaml", "map/mixed.yaml"):
+        assert all(commented for name, _, commented in entries if name == root), root
+
+
+def test_presets_change_only_what_the_root_explains() -> None:
+    entries = list(keys_with_comments())
+    groups = {"map", "sensor", "task", "logger", "algo"}
+    known = {key for name, key, _ in entries if name == "train.yaml" or name.split("/")[0] in groups}
+    for name, key, _ in entries:
+        if name.startswith("preset/"):
+            assert key in known, f"{name}: {key}"
+
+
+def as_lists(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
+
+
+def test_the_code_has_the_defaults_of_the_configuration() -> None:
+    assert conf("map/mixed.yaml") == as_lists(asdict(MapSettings()))
+    assert conf("task/default.yaml") == as_lists(asdict(TaskSettings()))
+    assert conf("train.yaml")["network"] == asdict(Widths())
+
+
+def test_every_map_set_gives_every_setting() -> None:
+    for path in sorted((CONF_DIR / "map").glob("*.yaml")):
+        assert list(conf(f"map/{path.name}")) == list(asdict(MapSettings())), path.name
+        MapSettings(**conf(f"map/{path.name}"))
+
+
+def test_every_measure_has_its_file_with_the_range_of_the_code() -> None:
+    files = {path.stem: conf(f"algo/distortion/{path.name}") for path in (CONF_DIR / "algo/distortion").glob("*.yaml")}
+    assert {values["name"] for values in files.values()} == set(MEASURES)
+    for values in files.values():
+        measure = MEASURES[values["name"]]()  # type: ignore[call-arg]
+        assert (values["low"], values["high"]) == (measure.low, measure.high)
+        assert all(beta in measure.domain for beta in values["evaluation_betas"])
+
+
+def test_every_sensor_has_its_file() -> None:
+    assert {conf(f"sensor/{path.name}")["name"] for path in (CONF_DIR / "sensor").glob("*.yaml")} == SENSORS
+    assert {path.stem for path in (CONF_DIR / "sensor").glob("*.yaml")} == SENSORS
