@@ -86,7 +86,7 @@ def test_quantiles_of_a_markov_chain() -> None:
         return TensorDict(content, batch_size=(sequences, 3))
 
     loss = make_loss(Neutral(), None, alpha=1e-6, gamma=0.5)
-    train(loss, 500, make_batch, learning_rate=5e-3, coefficient=0.05)
+    train(loss, 400, make_batch, learning_rate=5e-3, coefficient=0.05)
     tau = torch.tensor([0.05, 0.125, 0.25, 0.5, 0.75, 0.875, 0.95])
     with torch.no_grad():
         head = loss.critic_network[0][1].module
@@ -119,7 +119,7 @@ def test_bandit_with_a_safe_and_a_risky_arm() -> None:
         return TensorDict(content, batch_size=(number, 2))
 
     loss = make_loss(measure, measure, alpha=0.2, gamma=0.9)
-    train(loss, 400, make_batch, learning_rate=5e-3, coefficient=0.05)
+    train(loss, 300, make_batch, learning_rate=5e-3, coefficient=0.05)
     value = {beta: [arm_value(loss, beta, action) for action in (-0.5, 0.5)] for beta in (-2.0, -1.0, 0.0)}
     safe = {beta: probability_of_safe_arm(loss, beta) for beta in (-2.0, -1.0, 0.0)}
     # For +-s the power law weighs the loss by 1 - (1/2)^(1 - beta): -0.75 s at -2, -0.5 s at -1, 0 at 0.

@@ -14,7 +14,8 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl.objectives.utils import ValueEstimators
 
 from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
-from rcdsac_trl.agent.losses import DistributionalSACLoss, quantile_huber_loss, squash
+from rcdsac_trl.agent.functional import quantile_huber_loss, squash
+from rcdsac_trl.agent.losses import DistributionalSACLoss
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw
 
@@ -467,6 +468,10 @@ def test_state_dict_continues_bit_for_bit() -> None:
         optimizer.step()
     resumed.load_state_dict(loss.state_dict())
     copied = copy.deepcopy(loss)
+    with torch.no_grad():
+        for module in (loss, resumed, copied):
+            for parameter in module.parameters():
+                parameter.mul_(1.1)
     expected = loss(batch)
     assert (resumed(batch) == expected).all()
     assert (copied(batch) == expected).all()

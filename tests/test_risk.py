@@ -13,7 +13,7 @@ from rcdsac_trl.agent.risk import CPW, MEASURES, CVaR, Interval, Neutral, PowerL
 from rcdsac_trl.errors import UserInputError
 
 # Midpoints of a fine partition of (0, 1): quadrature for every expectation over tau or u below.
-NUMBER = 400_000
+NUMBER = 200_000
 TAU = (torch.arange(NUMBER, dtype=torch.float64) + 0.5) / NUMBER
 MEAN, DEVIATION = 1.5, 2.0
 
@@ -141,7 +141,7 @@ def test_dual_density_gives_the_same_value(name: str, beta: float) -> None:
     density_ = measure.weight(TAU, as_tensor(beta))
     assert density_.mean().item() == pytest.approx(1.0, abs=2e-3)
     dual = (density_ * normal_quantile(TAU)).mean().item()
-    assert dual == pytest.approx(value(measure, beta), abs=2e-2)
+    assert dual == pytest.approx(value(measure, beta), abs=3e-2)
 
 
 @pytest.mark.parametrize("name", ["cpw", "var"])

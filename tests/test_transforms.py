@@ -124,6 +124,18 @@ def test_a_value_passed_to_reset_is_told() -> None:
     assert torch.equal(rollout["risk"][1:, 2], wanted[1:])
 
 
+def test_a_value_passed_to_the_reset_of_some_agents_is_told_to_them() -> None:
+    env = make_env()
+    env.reset()
+    marked = torch.tensor([[True], [False], [True], [False]])
+    # As always in TorchRL, the others keep what the input holds.
+    given = torch.tensor([[-1.5], [-0.3], [-1.0], [-0.4]])
+    told = env.reset(TensorDict({"_reset": marked, "risk": given}, batch_size=[AGENTS]))
+    assert torch.equal(told["risk"], given)
+    later = env.rollout(2, auto_reset=False, tensordict=told, break_when_any_done=False)
+    assert torch.equal(later["risk"][:, 1], given)
+
+
 def test_fixed_values() -> None:
     rollout = make_env(fixed=[-1.0, -0.5, 0.0, -2.0]).rollout(9, break_when_any_done=False)
     assert (rollout["risk"][..., 0] == torch.tensor([[-1.0], [-0.5], [0.0], [-2.0]])).all()

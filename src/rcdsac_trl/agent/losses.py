@@ -11,8 +11,6 @@ Public names::
         .encode_actor(batch), .compute_target(..), .qvalue_loss(..), .actor_loss(..): the parts of forward
         SoftUpdate(loss, eps=...) works; parameters: loss.actor_network_params, loss.critic_network_params,
         loss.log_alpha
-    quantile_huber_loss(quantiles [..,N], targets [..,N'], tau [..,N], kappa=1) -> [..]
-    squash(loc, scale, noise) -> action, log_prob
 """
 
 import math
@@ -24,70 +22,16 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, TensorDictSequential
 from torch import Tensor, nn
-from torch.nn import functional as F
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import (
     ValueEstimators,
-    _cache_values,
     _reduce,
     dispatch_value_estimator,
     distance_loss,
 )
 
+from rcdsac_trl.agent.functional import call_head, minimum, quantile_huber_loss, squash
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
-
-
-def quantile_huber_loss(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
-    r"""Quantile regression by pairwise Huber errors, as the paper normalises it.
-
-    .. math:: \frac{1}{N'} \sum_{i=1}^{N} \sum_{j=1}^{N'}
-              |\tau_i - \mathbb{I}\{\delta_{ij} < 0\}| \, L_\kappa(\delta_{ij}) / \kappa,
-              \qquad \delta_{ij} = \text{targets}_j - \text{quantiles}_i
-
-    with :math:`L_\kappa(x) = x^2/2` up to :math:`\kappa` and :math:`\kappa(|x| - \kappa/2)` beyond (paper, critic loss;
-    its printed :math:`\min\{x^2, 2|x|-1\}/2` is never quadratic, a misprint).
-
-    Args:
-        quantiles: predictions ``[.., N]``; gradients flow.
-        targets: target samples ``[.., N']``; treated as constants by the caller.
-        tau: fractions ``[.., N]`` of the predictions, broadcastable to them.
-        kappa: where the loss turns from quadratic to linear, above 0.
-
-    Returns:
-        The loss ``[..]``: a sum over the predictions, a mean over the targets.
-
-    Example:
-        >>> quantile_huber_loss(torch.zeros(1), torch.tensor([2.0]), torch.tensor([0.25]))
-        tensor(0.3750)
-    """
-    shape = torch.broadcast_shapes(quantiles.unsqueeze(-1).shape, targets.unsqueeze(-2).shape)
-    prediction, target = quantiles.unsqueeze(-1).expand(shape), targets.unsqueeze(-2).expand(shape)
-    huber = F.huber_loss(prediction, target, reduction="none", delta=kappa)
-    with torch.no_grad():
-        weight = (tau.unsqueeze(-1) - (target < prediction).to(tau.dtype)).abs_()
-    # One product and sum instead of a mean and a sum: the [.., N, N'] tensors dominate the cost.
-    return (huber * weight).sum((-2, -1)) / (kappa * targets.shape[-1])
-
-
-def squash(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return ``tanh(loc + scale * noise)`` and its log density, both differentiable.
-
-    The distribution is TorchRL's ``TanhNormal(loc, scale)``; written out here because the noise comes from an
-    explicit generator and because it is a small part of that class's cost.
-
-    Args:
-        loc: mean before tanh ``[.., A]``.
-        scale: standard deviation before tanh ``[.., A]``.
-        noise: standard normal numbers ``[.., A]``.
-
-    Returns:
-        The action ``[.., A]`` and the log density ``[..]``.
-    """
-    raw = loc + scale * noise
-    # log(1 - tanh(x)^2), which stays exact where tanh saturates
-    log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
-    log_prob = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2.0 * math.pi) - log_slope
-    return raw.tanh(), log_prob.sum(-1)
 
 
 class DistributionalSACLoss(LossModule):
@@ -96,8 +40,8 @@ class DistributionalSACLoss(LossModule):
     With quantile critics it is RC-DSAC (networks conditioned on ``risk``) or DSAC (networks not conditioned); with
     scalar critics it is soft actor-critic. For a transition with risk parameter :math:`\beta`:
 
-    - critic: :func:`quantile_huber_loss` at fractions :math:`\tau_i, \tau'_j \sim U(0,1)` between
-      :math:`\hat Z_{\tau_i}(s_t, a_t; \beta)` and
+    - critic: :func:`~rcdsac_trl.agent.functional.quantile_huber_loss` at fractions
+      :math:`\tau_i, \tau'_j \sim U(0,1)` between :math:`\hat Z_{\tau_i}(s_t, a_t; \beta)` and
       :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a; \beta) - \alpha \log\pi(a|s_{t+1},\beta))`,
       with a policy action :math:`a` and the element-wise minimum over the target critics; summed over the critics;
     - actor: :math:`\alpha \log\pi - \min_k \frac1K \sum_j \hat Z^k_{\psi(\tau_j;\beta)}(s_t, a; \beta)`;
@@ -288,11 +232,6 @@ class DistributionalSACLoss(LossModule):
         """The temperature, detached."""
         return self.log_alpha.detach().exp()
 
-    @property
-    @_cache_values
-    def _cached_detached_critic_params(self) -> TensorDictBase:
-        return self.critic_network_params.detach()
-
     # ------------------------------------------------------------------------------------------- the losses
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the three losses and detached diagnostics of a batch ``[B, L+1]``.
@@ -338,7 +277,7 @@ class DistributionalSACLoss(LossModule):
                 for critic in self._critics:
                     memory = self._encode(critic, tensordict)[:, 1:]
                     values.append(self._evaluate(critic, memory, action, tau, risk))
-            next_value = _minimum(values) - self.alpha * log_prob.unsqueeze(-1)
+            next_value = minimum(values) - self.alpha * log_prob.unsqueeze(-1)
             # The estimator checks shapes strictly, so every target fraction gets its own entry.
             outcome = TensorDict(batch_size=batch.batch_size)
             keys = self.value_estimator.tensor_keys
@@ -380,12 +319,12 @@ class DistributionalSACLoss(LossModule):
         tau = self._fractions(self.num_risk_samples, log_prob)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, risk)
-        with self._cached_detached_critic_params.to_module(self.critic_network, preserve_module_state=False):
+        with self.critic_network_params.detach().to_module(self.critic_network, preserve_module_state=False):
             values = [
                 self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
                 for critic, memory in zip(self._critics, critic_memories, strict=True)
             ]
-        return self.alpha * log_prob - _minimum(values), log_prob.detach()
+        return self.alpha * log_prob - minimum(values), log_prob.detach()
 
     # ------------------------------------------------------------------------------------------- parts of them
     def _encode(self, network: TensorDictSequential, tensordict: TensorDictBase) -> Tensor:
@@ -407,7 +346,7 @@ class DistributionalSACLoss(LossModule):
     def _act(self, memory: Tensor, risk: Tensor | None) -> tuple[Tensor, Tensor]:
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             entries = {self.actor_network[0].out_keys[0]: memory, self.tensor_keys.risk: risk}
-            policy = _call(self.actor_network[1], entries)
+            policy = call_head(self.actor_network[1], entries)
         loc, scale = (policy.get(key) for key in self.actor_network[1].out_keys)
         noise = torch.randn(loc.shape, generator=self._generator, device=self._generator.device)
         return squash(loc, scale, noise.to(loc))
@@ -421,7 +360,7 @@ class DistributionalSACLoss(LossModule):
             self.tensor_keys.tau: tau,
             self.tensor_keys.risk: risk,
         }
-        return _call(critic[1], entries).get(critic[1].out_keys[0])
+        return call_head(critic[1], entries).get(critic[1].out_keys[0])
 
     def _fractions(self, number: int, like: Tensor) -> Tensor | None:
         """Draw fractions ``[B, L or 1, number]`` for a tensor ``[B, L, ..]``; None for scalar critics."""
@@ -438,20 +377,3 @@ class DistributionalSACLoss(LossModule):
             if self._distributional:
                 diagnostics["quantile_spread"] = stacked.std(-1, correction=0).mean(0)
             return diagnostics
-
-
-def _call(head: TensorDictSequential, entries: dict[NestedKey, Tensor | None]) -> TensorDictBase:
-    """Run a head on the entries it reads; their time dimensions may be 1, so only the first is the batch's."""
-    memory = next(value for value in entries.values() if value is not None)
-    inputs = TensorDict(batch_size=memory.shape[:1])
-    for key in head.in_keys:
-        inputs.set(key, entries[key])
-    return head(inputs)
-
-
-def _minimum(values: list[Tensor]) -> Tensor:
-    """Element-wise minimum over the critics."""
-    smallest = values[0]
-    for value in values[1:]:
-        smallest = torch.minimum(smallest, value)
-    return smallest

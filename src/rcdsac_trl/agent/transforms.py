@@ -67,8 +67,7 @@ class EpisodeSampler(Transform):
         for row in rows:
             episode = self._next_episodes[row]
             self._next_episodes[row] += 1
-            # A reset in the middle of a rollout carries the finished episode's number along: that is no request.
-            if brought is not None and marked is None:
+            if brought is not None:
                 self._told[row] = brought.reshape(-1)[row]
             elif self.fixed is not None:
                 self._told[row] = self.fixed[row]
@@ -84,6 +83,13 @@ class EpisodeSampler(Transform):
         """Add the key to the observations."""
         observation_spec[self.key] = Unbounded((*observation_spec.shape, 1), device=observation_spec.device)
         return observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Add the key to the state: a reset shows transforms nothing else of what it was given."""
+        if input_spec["full_state_spec"] is None:
+            input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
+        self.transform_observation_spec(input_spec["full_state_spec"])
+        return input_spec
 
 
 class Relabel:

@@ -156,16 +156,18 @@ class Trainer:
         t1 = time.monotonic()
         self.learner.replay.add_episodes(batch)
         self.steps += batch.numel()
+        # Before the updates: episodes are logged under the number of updates that they were driven with.
+        record = self._training_record(iteration, batch)
+        t2 = time.monotonic()
         diagnostics = self.learner.updates(self.schedule.updates_per_iteration, fraction)
         self.updates += self.schedule.updates_per_iteration
-        t2 = time.monotonic()
-        record = self._training_record(iteration, batch)
+        t3 = time.monotonic()
         record |= {f"learn/{key}": value for key, value in diagnostics.items()}
         record |= {
             "learn/range_fraction": fraction,
             "learn/updates": float(self.updates),
             "time/steps_per_s": batch.numel() / (t1 - t0),
-            "time/updates_per_s": self.schedule.updates_per_iteration / max(t2 - t1, 1e-9),
+            "time/updates_per_s": self.schedule.updates_per_iteration / max(t3 - t2, 1e-9),
         }
         last = iteration + 1 == self.schedule.iterations
         if last or (iteration + 1) % self.validate_every == 0:

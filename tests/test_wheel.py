@@ -1,0 +1,81 @@
+"""The wheel alone, outside the checkout: it carries the configuration, trains, and leaves a complete run folder."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = (
+    "preset=smoke",
+    "schedule.iterations=1",
+    "schedule.updates_per_iteration=1",
+    "task.episode_steps=20",
+    "world.num_agents=2",
+    "world.num_workers=0",
+    "learner.sequence_length=4",
+    "validation.num_maps=1",
+    "threads=1",
+)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel and unpack it, as an installer does."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    subprocess.run(build, cwd=folder, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "site")
+    return folder / "site"
+
+
+def python(installed: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in a folder; what is installed comes before an editable checkout."""
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+def files_below(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_the_wheel_holds_the_configuration_and_no_leftovers(installed: Path) -> None:
+    assert not installed.is_relative_to(ROOT)
+    assert files_below(installed / "rcdsac_trl" / "conf") == files_below(ROOT / "conf")
+    names = list(files_below(installed))
+    assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"rcdsac_trl"}
+    assert {Path(name).suffix for name in names if name.startswith("rcdsac_trl/")} == {".py", ".yaml", ".typed"}
+
+
+def test_the_wheel_trains_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
+    found = python(installed, tmp_path, "-c", "import rcdsac_trl; print(rcdsac_trl.__file__)")
+    assert Path(found.stdout.strip()) == installed / "rcdsac_trl" / "__init__.py"
+    run = tmp_path / "run"
+    trained = python(installed, tmp_path, "-m", "rcdsac_trl.train", "+algo=sac", *TINY, f"hydra.run.dir={run}")
+    assert trained.returncode == 0, trained.stderr
+    assert {path.name for path in run.iterdir()} == {
+        ".hydra",
+        "checkpoints",
+        "config.yaml",
+        "csv",
+        "manifest.json",
+        "tensorboard",
+        "train.log",
+        "training_episodes.csv",
+        "validation_episodes.csv",
+    }
+    assert {path.name for path in (run / "checkpoints").iterdir()} == {"best", "last"}
+    assert yaml.safe_load((run / "config.yaml").read_text())["algo"]["name"] == "sac"
+    assert json.loads((run / "manifest.json").read_text())["commit"] == "none"
+    assert len(pd.read_csv(run / "training_episodes.csv")) == 2
+    assert len(pd.read_csv(run / "validation_episodes.csv")) == 2
+    assert list(tmp_path.iterdir()) == [run]
