@@ -226,13 +226,13 @@ def test_a_reset_can_name_its_episode(serial: bool | None) -> None:
 
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_collision_weight_scales_the_collision_reward_alone(num_workers: int) -> None:
-    def run(weight: float) -> TensorDictBase:
+    def run(weight: float, num_workers: int) -> TensorDictBase:
         env = make_env(SMALL, seed=5, num_workers=num_workers, weighted_collisions=True)
         driven = drive(env, 120, weight)
         env.close()
         return driven
 
-    plain, heavy = run(1.0), run(2.0)
+    plain, heavy = run(1.0, 0), run(2.0, num_workers)
     assert (plain["reward_components"][..., 4] < 0).any()
     assert_equal(plain.exclude("reward", "collision_weight"), heavy.exclude("reward", "collision_weight"))
     difference = heavy["reward"] - plain["reward"]

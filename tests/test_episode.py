@@ -8,6 +8,7 @@ import pytest
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world import episode as core
+from rcdsac_trl.world.agents import AgentGroup
 from rcdsac_trl.world.maps import Map, MapSettings
 from rcdsac_trl.world.simulation import StepResult
 from rcdsac_trl.world.task import TaskSettings
@@ -67,12 +68,12 @@ def scripted(monkeypatch: pytest.MonkeyPatch):
         script: list[StepResult],
         corners: Sequence[tuple[float, float]] = (),
         task: TaskSettings | None = None,
-    ) -> tuple[core.AgentGroup, ScriptedPlanner, ScriptedSimulation]:
+    ) -> tuple[AgentGroup, ScriptedPlanner, ScriptedSimulation]:
         planner, simulation = ScriptedPlanner(corners), ScriptedSimulation()
         simulation.script = script
         monkeypatch.setattr(core, "load_map", lambda *_: (EMPTY, planner))
         monkeypatch.setattr(core, "Simulation", lambda gui: simulation)
-        group = core.AgentGroup(
+        group = AgentGroup(
             MapSettings(),
             task,
             sensor="full",
@@ -260,13 +261,11 @@ def test_actions_that_are_none_are_refused(scripted, action: np.ndarray) -> None
 def test_wrong_settings_are_refused_by_name(name: str, value: object) -> None:
     good: dict[str, object] = {"sensor": "full", "split": "train", "seed": 0, "agent_ids": (0,)}
     with pytest.raises(UserInputError, match=name):
-        core.AgentGroup(None, None, **({"first_episode": 0, "gui": False} | good | {name: value}))
+        AgentGroup(None, None, **({"first_episode": 0, "gui": False} | good | {name: value}))
 
 
 def test_an_agent_that_was_never_reset_says_so() -> None:
-    group = core.AgentGroup(
-        None, None, sensor="full", split="train", seed=0, agent_ids=(0,), first_episode=0, gui=False
-    )
+    group = AgentGroup(None, None, sensor="full", split="train", seed=0, agent_ids=(0,), first_episode=0, gui=False)
     with pytest.raises(UserInputError, match="reset"):
         group.scene(0)
     group.close()

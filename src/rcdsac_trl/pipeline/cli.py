@@ -13,7 +13,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -79,7 +79,9 @@ def precheck(
 
     Calls that only show something (``--help``, ``--cfg``, ..) are left to Hydra.
     """
-    args = get_args_parser().parse_args(argv)
+    args, unknown = get_args_parser().parse_known_args(argv)
+    if unknown:
+        raise UserInputError(f"there is no option {unknown[0]}: --help lists them")
     if args.help or args.hydra_help or args.cfg or args.info:
         return
     for overrides in _jobs(args.overrides) if args.multirun else [args.overrides]:
@@ -93,7 +95,7 @@ def _jobs(overrides: list[str]) -> list[list[str]]:
     try:
         parsed = OverridesParser.create().parse_overrides(overrides)
     except HydraException as error:
-        raise UserInputError(" ".join(str(error).split())) from error
+        raise UserInputError(_sentence(error, "", overrides)) from error
     return [job for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
 
 
@@ -117,7 +119,7 @@ def _compose(config_name: str, overrides: list[str], *, return_hydra_config: boo
     with nullcontext() if inside else hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
         try:
             return hydra.compose(config_name, overrides=overrides, return_hydra_config=return_hydra_config)
-        except (HydraException, OmegaConfBaseException) as error:
+        except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise UserInputError(_sentence(error, config_name, overrides)) from error
 
 
@@ -128,14 +130,32 @@ def choices(group: str) -> list[str]:
 
 def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     text = str(error)
+    if isinstance(error, OverrideParseException):
+        return f"{error.override} cannot be read: write it as <key>=<value>, and lists in brackets"
     if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']+)'", text):
         group, name = match.groups()
         return f"{group}={name} does not exist: choose one of {', '.join(choices(group))}"
+    for override in overrides:
+        group, _, name = override.lstrip("+").partition("=")
+        if name == "null" and choices(group):
+            return f"{group}=null chooses nothing: choose one of {', '.join(choices(group))}"
     if config_name == "train" and any(override.startswith("algo=") for override in overrides):
         return f"write +algo=<name> (with a plus): one of {', '.join(choices('algo'))}"
-    if match := re.search(r"Key '([^']+)' is not in struct\s+full_key: (\S+)", text):
-        return unknown_key(match[2], _all_keys(config_name, overrides))
+    if match := re.match(r"Ambiguous value for argument '([^']+)'", text):
+        return f"{match[1]} holds several values: write a list in brackets, or add -m to run one job for each"
+    if match := re.match(r"Multiple values for (\S+)\.", text):
+        return f"{match[1]} is chosen twice: write {match[1]}=<name> once, without a plus"
+    if match := re.match(r"Could not override '([^']+)'", text):
+        return _no_key(match[1], _all_keys(config_name, overrides))
     return " ".join(text.split())
+
+
+def _no_key(key: str, known: list[str]) -> str:
+    group = key.split(".")[0]
+    if group != key and group not in known and choices(group):
+        plus = "+" if group == "algo" else ""
+        return f"{key} needs a choice of {group}: add {plus}{group}=<name>, one of {', '.join(choices(group))}"
+    return unknown_key(key, known)
 
 
 def _all_keys(config_name: str, overrides: list[str]) -> list[str]:

@@ -1,5 +1,6 @@
 """Evaluation: the same maps, starts and goals for every agent, deterministic actions, one row an episode."""
 
+import contextlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -83,6 +84,56 @@ def evaluate(
     return table.sort_values(["beta", "collision_weight", "map", "episode"], ignore_index=True)
 
 
+class Validation:
+    """Measures a policy on the same maps at every call, for as long as it trains.
+
+    Args:
+        env: as for :func:`evaluate`; made for this alone, and closed by :meth:`close`.
+        policy: acts; its weights may change between calls.
+        conditions: what the agents of each block are told.
+        num_agents: episodes a map and a condition.
+        num_maps: maps to drive on.
+        steps: length of an episode.
+        seed: root seed of the maps.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase,
+        *,
+        conditions: Sequence[Condition],
+        num_agents: int,
+        num_maps: int,
+        steps: int,
+        seed: int,
+    ) -> None:
+        self.env = env
+        self.policy = policy
+        self.conditions = conditions
+        self.num_agents = num_agents
+        self.num_maps = num_maps
+        self.steps = steps
+        self.seed = seed
+
+    def __call__(self) -> pd.DataFrame:
+        """Return one row an episode, see :func:`evaluate`."""
+        self.env.set_seed(self.seed)
+        return evaluate(
+            self.env,
+            self.policy,
+            conditions=self.conditions,
+            num_agents=self.num_agents,
+            num_maps=self.num_maps,
+            steps=self.steps,
+        )
+
+    def close(self) -> None:
+        """Close the environment, and bear that its workers may be gone."""
+        with contextlib.suppress(RuntimeError):
+            self.env.close(raise_if_closed=False)
+
+
 class EvaluationRun:
     """An evaluation and the folder it writes: ``episodes.csv``, ``summary.csv`` and ``evaluation.json``.
 
@@ -108,6 +159,8 @@ class EvaluationRun:
         self.described = json.dumps(described, indent=2) + "\n"
         self.num_maps = num_maps
         self.rows = rows
+        if out.exists() and not out.is_dir():
+            raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
         path = out / "evaluation.json"
         if path.exists() and path.read_text() != self.described:
             raise UserInputError(f"{out} holds an evaluation of something else: give another folder with out=<folder>")

@@ -49,8 +49,9 @@ class DistortionSettings:
     def __post_init__(self) -> None:
         """Check every beta against the measure's domain."""
         object.__setattr__(self, "evaluation_betas", tuple(float(beta) for beta in self.evaluation_betas))
+        measure = self.measure
         for beta in self.evaluation_betas:
-            self.measure.check(beta)
+            measure.check(beta)
 
     @property
     def measure(self) -> RiskMeasure:
@@ -94,6 +95,14 @@ class AlgoSettings:
             )
         if self.beta is not None:
             self.distortion.measure.check(self.beta)
+        if self.relabel == "resample" and self.conditioning != "per_episode":
+            raise UserInputError(
+                f"algo.relabel=resample does nothing with algo.conditioning={self.conditioning}: use stored"
+            )
+        if self.conditioning == "per_episode" and not self.distortion.evaluation_betas:
+            raise UserInputError(
+                "algo.distortion.evaluation_betas=[] leaves nothing to validate: give one beta or more"
+            )
         if self.collision_weight is not None:
             low, high = self.collision_weight
             if not 0 <= low <= high:
@@ -107,6 +116,21 @@ class AlgoSettings:
             raise UserInputError(
                 f"algo.evaluation_collision_weights={list(weights)} does not go with "
                 f"algo.collision_weight={self.collision_weight}: give both or neither"
+            )
+        if weights and self.conditioning == "per_episode":
+            raise UserInputError(
+                "algo.collision_weight does not go with algo.conditioning=per_episode: an episode tells the networks "
+                "either a weight or a beta"
+            )
+        for weight in weights:
+            self._check_weight(weight)
+        check_unique(self.default_conditions)
+
+    def _check_weight(self, weight: float) -> None:
+        low, high = self.collision_weight or (1.0, 1.0)
+        if not low <= weight <= high:
+            raise UserInputError(
+                f"collision weight {weight:g} is outside {self.name}'s range [{low:g}, {high:g}]: choose one inside"
             )
 
     @property
@@ -134,7 +158,7 @@ class AlgoSettings:
         """Turn what a user asks of an evaluation into conditions.
 
         Raises:
-            UserInputError: if a beta is missing, superfluous or outside the domain, or a weight superfluous.
+            UserInputError: if a beta is missing, or a beta or a weight is superfluous or outside its domain.
         """
         if weights is not None and self.collision_weight is None:
             raise UserInputError(f"{self.name} has no collision weight: leave collision_weight out")
@@ -149,6 +173,8 @@ class AlgoSettings:
             told = f"was trained for beta={self.beta:g} alone" if self.beta is not None else "has no beta"
             raise UserInputError(f"{self.name} {told}: leave beta={list(betas)} out")
         elif weights is not None:
+            for weight in weights:
+                self._check_weight(weight)
             asked = [Condition(collision_weight=float(weight)) for weight in weights]
         else:
             asked = self.default_conditions
@@ -170,7 +196,7 @@ class WorldSettings:
     def __post_init__(self) -> None:
         """Refuse an unknown sensor and agents that the workers cannot share."""
         if self.sensor not in SENSORS:
-            raise UserInputError(f"sensor.name={self.sensor} is unknown: choose one of {', '.join(SENSORS)}")
+            raise UserInputError(f"sensor.name={self.sensor} is unknown: choose one of {', '.join(sorted(SENSORS))}")
         if self.num_agents < 1:
             raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
         resolve_num_workers(self.num_workers, self.num_agents)

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from tqdm import tqdm
 
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
+from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics
 from rcdsac_trl.pipeline.replay import SequenceReplay
@@ -86,7 +87,7 @@ class Trainer:
         collector: yields the episodes of one iteration, ``[..., T]``.
         set_iteration: told the iteration whose episodes are about to be collected.
         learner: does the updates.
-        validate: returns one row an episode on validation maps.
+        validate: returns one row an episode on validation maps; closed at the end, as the collector is.
         validate_every: iterations between validations.
         checkpoints: where the agent is saved.
         checkpoint_every: iterations between checkpoints.
@@ -101,7 +102,7 @@ class Trainer:
         collector: Collector,
         set_iteration: Callable[[int], None],
         learner: Learner,
-        validate: Callable[[], pd.DataFrame],
+        validate: Validation,
         validate_every: int,
         checkpoints: Checkpoints,
         checkpoint_every: int,
@@ -142,6 +143,7 @@ class Trainer:
             finally:
                 # A shell's Ctrl-C may have ended the workers already: closing must not hide why training ends.
                 self.collector.shutdown(raise_on_error=False)
+                self.validate.close()
                 self.log.close()
 
     def _episodes(self) -> Iterator[TensorDictBase]:

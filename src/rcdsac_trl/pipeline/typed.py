@@ -12,6 +12,7 @@ from rcdsac_trl.errors import UserInputError
 Settings = TypeVar("Settings")
 
 _NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
+_PLURALS = {int: "whole numbers", float: "numbers", bool: "true or false", str: "words"}
 
 
 def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> Settings:
@@ -95,6 +96,6 @@ def _describe(hint: Any) -> str:
     if origin is Literal:
         return ("one of " if len(args) > 1 else "") + ", ".join(str(arg) for arg in args)
     if origin is tuple:
-        length = "a list" if args[-1] is Ellipsis else f"a list of {len(args)}"
-        return f"{length}, each {_describe(args[0])}"
+        number = "" if args[-1] is Ellipsis else f"{len(args)} "
+        return f"a list of {number}{_PLURALS[args[0]]} in brackets"
     return _NAMES.get(hint, "a section with keys of its own")

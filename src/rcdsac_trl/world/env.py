@@ -12,7 +12,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.world.episode import AgentGroup
+from rcdsac_trl.world.agents import AgentGroup
 from rcdsac_trl.world.maps import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES, Space

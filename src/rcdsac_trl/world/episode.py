@@ -1,7 +1,4 @@
-"""The core of the environment: agents, their episodes, starts, goals, waypoints, contact onsets and reward.
-
-It knows neither TorchRL nor Gymnasium: :mod:`rcdsac_trl.world.env` and :mod:`rcdsac_trl.world.gym` are thin
-adapters over :class:`AgentGroup`.
+"""One agent's episodes: its starts, goals and waypoints, its contacts and what it is paid.
 
 Everything random in episode ``k`` of agent ``i`` comes from ``stream(seed, "<purpose>/<split>", k, i, ...)``,
 and each goal is drawn relative to the goal before it. So maps, starts, goals and control periods are the same
@@ -10,7 +7,7 @@ whatever the agent does, and whichever group and process holds it.
 
 import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -19,13 +16,11 @@ from numpy.typing import NDArray
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world import task as rules
-from rcdsac_trl.world.lidar import NUM_BINS, sensor_mask
-from rcdsac_trl.world.maps import SPLITS, MapSettings, Split, generate_map
+from rcdsac_trl.world.maps import MapSettings, Split, generate_map
 from rcdsac_trl.world.planner import Planner
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.shapes import Map
 from rcdsac_trl.world.simulation import Simulation
-from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES, Buffers
 from rcdsac_trl.world.task import TaskSettings
 
 Pose = tuple[float, float, float]
@@ -34,8 +29,6 @@ Pose = tuple[float, float, float]
 # reset alone, or an evaluation beside the training, does not make the others' map again.
 _MAPS_KEPT = 8
 _TRAIL_STEPS = 1000
-# A tanh or a clamp in float32 stays within 1; this forgives rounding in other arithmetic.
-_ACTION_TOLERANCE = 1e-6
 
 
 @lru_cache(maxsize=_MAPS_KEPT)
@@ -183,140 +176,3 @@ class NavigationAgent:
         task = self._task
         distances = self._require_simulation().scan()
         self.distances_m = rules.noisy_ranges(distances, task.range_noise_std_m, task.range_dropout, self._noise)
-
-
-class AgentGroup:
-    """The agents that one environment holds, each in its own simulation and with its own episode counter.
-
-    Args:
-        map_settings: how maps are generated.
-        task: rules of the task.
-        sensor: one of :data:`rcdsac_trl.world.lidar.SENSORS`.
-        split: which of the disjoint map sets.
-        seed: root seed, at least 0.
-        agent_ids: the agents' global numbers, at least 0; agents with equal numbers meet the same episodes.
-        first_episode: number of each agent's first episode, at least 0.
-        gui: show PyBullet's window for the first agent.
-
-    Attributes:
-        buffers: what the agents wrote last, overwritten by every reset and step.
-
-    Raises:
-        UserInputError: a value is outside its limits.
-    """
-
-    def __init__(
-        self,
-        map_settings: MapSettings | None,
-        task: TaskSettings | None,
-        *,
-        sensor: str,
-        split: Split,
-        seed: int,
-        agent_ids: Sequence[int],
-        first_episode: int,
-        gui: bool,
-    ) -> None:
-        if split not in SPLITS:
-            raise UserInputError(f"split={split!r} does not exist; choose one of {', '.join(SPLITS)}")
-        if not agent_ids or min(agent_ids) < 0:
-            raise UserInputError(f"agent_ids={list(agent_ids)} must be one or more whole numbers of at least 0")
-        self.task = task or TaskSettings()
-        mask = sensor_mask(sensor)
-        self._agents = [
-            NavigationAgent(
-                map_settings or MapSettings(),
-                self.task,
-                mask,
-                split,
-                agent_id,
-                gui=gui and row == 0,  # PyBullet opens one window a process
-            )
-            for row, agent_id in enumerate(agent_ids)
-        ]
-        self._mask = mask
-        self._first_episode = _not_negative("first_episode", first_episode)
-        self._distances = np.full((len(agent_ids), NUM_BINS), np.inf)
-        self.buffers = Buffers.zeros(len(agent_ids))
-        self.set_seed(seed)
-
-    def __len__(self) -> int:
-        """Return the number of agents."""
-        return len(self._agents)
-
-    def set_seed(self, seed: int) -> None:
-        """Set the root seed; the next reset of each agent begins its first episode."""
-        self._seed = _not_negative("seed", seed)
-        self._next_episodes = [self._first_episode] * len(self)
-
-    def reset(self, rows: Iterable[int], episode: int | None = None) -> None:
-        """Begin an episode of some agents: their next one, or the given one, from which they count on."""
-        buffers = self.buffers
-        for row in rows:
-            number = self._next_episodes[row] if episode is None else _not_negative("episode", episode)
-            self._agents[row].reset(self._seed, number)
-            self._next_episodes[row] = number + 1
-            buffers.reward_components[row] = 0.0
-            buffers.reward[row] = 0.0
-            self._collect(row)
-        self._see()
-
-    def step(self, actions: NDArray, collision_weights: NDArray | None = None) -> None:
-        """Take one agent step with every agent.
-
-        Args:
-            actions: normalised actions, [n, 2], in [-1, 1].
-            collision_weights: factor of each agent's collision reward, [n], None for 1; the components are
-                written without it.
-
-        Raises:
-            UserInputError: an action is not a number in [-1, 1], or an agent was never reset.
-        """
-        buffers = self.buffers
-        for row, (agent, action) in enumerate(zip(self._agents, self._checked(actions), strict=True)):
-            buffers.reward_components[row] = agent.step(action)
-            self._collect(row)
-        weights = 1.0 if collision_weights is None else collision_weights
-        buffers.reward[:, 0] = rules.total_reward(buffers.reward_components, weights)
-        self._see()
-
-    def scene(self, row: int) -> Scene:
-        """Return what a picture of one agent shows."""
-        return self._agents[row].scene()
-
-    def close(self) -> None:
-        """Disconnect all simulations."""
-        for agent in self._agents:
-            agent.close()
-
-    def _checked(self, actions: NDArray) -> list[list[float]]:
-        # The comparison is false for NaN too.
-        if actions.shape != (len(self), ACTION_SIZE) or not (np.abs(actions) <= 1.0 + _ACTION_TOLERANCE).all():
-            raise UserInputError(
-                f"actions {actions.tolist()} must be {ACTION_SIZE} numbers in [-1, 1] for each of "
-                f"{len(self)} agents; look for NaN in the policy, or scale its output"
-            )
-        values: list[list[float]] = actions.tolist()
-        return values
-
-    def _collect(self, row: int) -> None:
-        agent, buffers = self._agents[row], self.buffers
-        buffers.pose[row] = agent.pose
-        buffers.waypoint[row] = rules.waypoint_observation(agent.pose, *agent.next_waypoints)
-        buffers.velocity[row] = rules.velocity_observation(*agent.velocities)
-        buffers.contact[row, 0] = agent.in_contact
-        buffers.goal_reached[row, 0] = agent.goal_reached
-        self._distances[row] = agent.distances_m
-
-    def _see(self) -> None:
-        """Write what is cheaper for all agents at once than for each: ranges, and the limits of velocities."""
-        buffers = self.buffers
-        buffers.range[:] = rules.range_observation(self._distances, self._mask)
-        limits = SPACES["velocity"]
-        np.clip(buffers.velocity, limits.low, limits.high, out=buffers.velocity)
-
-
-def _not_negative(name: str, value: int) -> int:
-    if not isinstance(value, int | np.integer) or value < 0:
-        raise UserInputError(f"{name}={value!r} must be a whole number of at least 0")
-    return int(value)

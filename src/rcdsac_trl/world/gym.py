@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.world.episode import AgentGroup
+from rcdsac_trl.world.agents import AgentGroup
 from rcdsac_trl.world.maps import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.spaces import ACTION_SIZE, AGENT_OBSERVATIONS, SPACES

@@ -77,7 +77,7 @@ class Renderer:
         >>> from rcdsac_trl.world.env import NavigationEnv
         >>> env = NavigationEnv(agent_ids=(0,))
         >>> _ = env.reset()
-        >>> Renderer(size_px=256).draw(env.agents[0].scene()).shape
+        >>> Renderer(size_px=256).draw(env.agents.scene(0)).shape
         (256, 256, 3)
     """
 

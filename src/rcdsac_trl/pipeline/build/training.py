@@ -1,9 +1,7 @@
 """A training run from its config."""
 
-from collections.abc import Callable
 from pathlib import Path
 
-import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -16,7 +14,7 @@ from rcdsac_trl.pipeline.build.agent import make_loss, make_optimizer, make_poli
 from rcdsac_trl.pipeline.build.read import training_settings
 from rcdsac_trl.pipeline.build.world import environment, evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
-from rcdsac_trl.pipeline.evaluation import evaluate
+from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.policies import CollectionPolicy
 from rcdsac_trl.pipeline.replay import SequenceReplay
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
@@ -116,21 +114,18 @@ def trainer(cfg: DictConfig, folder: Path) -> Trainer:
     )
 
 
-def _validation(settings: TrainingSettings, loss: LossModule, device: str) -> Callable[[], pd.DataFrame]:
-    algo, world, memory = settings.algo, settings.training_world, settings.network.memory
+def _validation(settings: TrainingSettings, loss: LossModule, device: str) -> Validation:
+    algo, world = settings.algo, settings.training_world
     conditions = algo.default_conditions
-    env = evaluation_environment(world, algo, conditions, "validation", VALIDATION_SEED, world.num_agents, memory)
-    policy = make_policy(loss, env, torch.Generator(device=device), device)
-
-    def validate() -> pd.DataFrame:
-        env.set_seed(VALIDATION_SEED)
-        return evaluate(
-            env,
-            policy,
-            conditions=conditions,
-            num_agents=world.num_agents,
-            num_maps=settings.validation.num_maps,
-            steps=world.task.episode_steps,
-        )
-
-    return validate
+    env = evaluation_environment(
+        world, algo, conditions, "validation", VALIDATION_SEED, world.num_agents, settings.network.memory
+    )
+    return Validation(
+        env,
+        make_policy(loss, env, torch.Generator(device=device), device),
+        conditions=conditions,
+        num_agents=world.num_agents,
+        num_maps=settings.validation.num_maps,
+        steps=world.task.episode_steps,
+        seed=VALIDATION_SEED,
+    )
