@@ -101,6 +101,10 @@ class TrainingSettings:
         runtime.resolve_threads(self.threads)
         if self.schedule.range_fraction(0) < 1 and self.algo.conditioning == "per_episode":
             self.algo.distortion.measure.widen(0.0, 0.0)  # refuses a measure without a neutral beta
+        if not self.algo.default_conditions:
+            raise UserInputError(
+                "algo.distortion.evaluation_betas=[] leaves nothing to validate: give one beta or more"
+            )
         episode_steps, sequence_length = self.task.episode_steps, self.learner.sequence_length
         if sequence_length > episode_steps:
             raise UserInputError(

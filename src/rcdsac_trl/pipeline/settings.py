@@ -99,10 +99,6 @@ class AlgoSettings:
             raise UserInputError(
                 f"algo.relabel=resample does nothing with algo.conditioning={self.conditioning}: use stored"
             )
-        if self.conditioning == "per_episode" and not self.distortion.evaluation_betas:
-            raise UserInputError(
-                "algo.distortion.evaluation_betas=[] leaves nothing to validate: give one beta or more"
-            )
         if self.collision_weight is not None:
             low, high = self.collision_weight
             if not 0 <= low <= high:

@@ -1,0 +1,83 @@
+"""The documents are true: their Python runs, their commands are accepted, what they name exists."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from rcdsac_trl import draw_maps
+from rcdsac_trl.paths import CONF_DIR
+from rcdsac_trl.pipeline.build import check_training
+from rcdsac_trl.pipeline.cli import compose
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+# The file that CONTRIBUTING.md has its reader write.
+NEW_ROW = "rcdsac_wang"
+
+
+def texts(pattern: str) -> list[tuple[str, str]]:
+    """Return document and text of everything the pattern finds."""
+    return [(path.name, found) for path in DOCUMENTS for found in re.findall(pattern, path.read_text(), re.M | re.S)]
+
+
+@pytest.mark.parametrize(("name", "code"), texts(r"^```python\n(.*?)^```"))
+def test_python_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, name, "exec"), {})
+
+
+def commands() -> list[tuple[str, str]]:
+    """Return verb and overrides of every command that names no folder of the reader's."""
+    found = {text.split("#")[0].strip() for _, text in texts(r"python -m rcdsac_trl\.([^\n`]+)") if "<" not in text}
+    return sorted((verb, rest) for verb, _, rest in (text.partition(" ") for text in found) if rest)
+
+
+@pytest.mark.parametrize(("verb", "arguments"), commands())
+def test_commands_are_accepted(verb: str, arguments: str) -> None:
+    overrides = shlex.split(arguments)
+    if "-m" in overrides:  # the first of all combinations stands for the others
+        overrides = [override.split(",")[0] for override in overrides if override != "-m"]
+    overrides = [override.replace(NEW_ROW, "rcdsac_pow") for override in overrides]
+    cfg = compose(verb, overrides)
+    if verb == "train":
+        check_training(cfg)
+    elif verb == "draw_maps":
+        draw_maps.check(cfg)
+
+
+def test_there_are_commands_of_every_verb() -> None:
+    verbs = {text.split()[0] for _, text in texts(r"python -m rcdsac_trl\.(\w+ [^\n`]+)")}
+    assert verbs == {"train", "evaluate", "plot_training", "draw_maps"}
+
+
+@pytest.mark.parametrize(("name", "target"), texts(r"\]\((?!https?:)([^)#]+)"))
+def test_links_lead_somewhere(name: str, target: str) -> None:
+    folder = next(path.parent for path in DOCUMENTS if path.name == name)
+    assert (folder / target).is_file()
+
+
+def test_named_files_exist() -> None:
+    for name, path in texts(r"`((?:world|agent|pipeline|tests|conf|docs)/[\w/.*-]+)`"):
+        places = (ROOT, ROOT / "src" / "rcdsac_trl")
+        exists = any(list(place.glob(path.rstrip("/"))) for place in places)
+        assert exists or path == f"conf/algo/{NEW_ROW}.yaml", f"{name} names {path}"
+
+
+def test_named_keys_exist() -> None:
+    cfg = compose("train", ["+algo=rcdsac_pow"])
+    sections = "|".join(section for section in cfg if OmegaConf.is_dict(cfg[section]))
+    named = texts(rf"`((?:{sections})\.[a-z_.]+)`")
+    assert len(named) > 20
+    for name, key in named:
+        section, _, last = key.rpartition(".")
+        assert last in OmegaConf.select(cfg, section), f"{name} names {key}"
+
+
+def test_every_row_and_choice_is_named() -> None:
+    running = (ROOT / "docs" / "running.md").read_text()
+    for group in ("algo", "algo/distortion", "preset", "sensor", "map", "task", "logger"):
+        for path in (CONF_DIR / group).glob("*.yaml"):
+            assert f"`{path.stem}`" in running, f"{group}={path.stem}"

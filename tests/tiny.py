@@ -1,0 +1,82 @@
+"""Real trainings that take about a second, for the tests of the pipeline."""
+
+from functools import cache
+from pathlib import Path
+
+import yaml
+from omegaconf import DictConfig
+
+from rcdsac_trl.paths import CONF_DIR
+from rcdsac_trl.pipeline import build
+from rcdsac_trl.pipeline.build.read import training_settings
+from rcdsac_trl.pipeline.cli import compose
+from rcdsac_trl.pipeline.run_settings import TrainingSettings
+from rcdsac_trl.pipeline.trainer import Trainer
+
+ROWS = sorted(path.stem for path in (CONF_DIR / "algo").glob("*.yaml"))
+"""Every row of the registry."""
+
+AGENTS = 2
+STEPS = 20
+ITERATIONS = 2
+UPDATES = 2
+
+TINY = [
+    "preset=smoke",
+    "map=easy",
+    "map.size_m=10",
+    "map.layouts=[clutter]",
+    "world.num_workers=0",
+    f"world.num_agents={AGENTS}",
+    f"task.episode_steps={STEPS}",
+    f"schedule.iterations={ITERATIONS}",
+    f"schedule.updates_per_iteration={UPDATES}",
+    "learner.sequence_length=4",
+    "learner.batch_size=2",
+    "validation.num_maps=1",
+    "threads=1",
+    "logger=none",
+]
+
+
+@cache
+def _tiny_cfg(overrides: tuple[str, ...]) -> DictConfig:
+    return compose("train", list(overrides))
+
+
+def tiny_cfg(row: str = "rcdsac_pow", *overrides: str) -> DictConfig:
+    """Compose the config of a tiny training."""
+    return _tiny_cfg((f"+algo={row}", *TINY, *overrides))
+
+
+def tiny_settings(row: str = "rcdsac_pow", *overrides: str) -> TrainingSettings:
+    """Read the settings of a tiny training."""
+    return training_settings(tiny_cfg(row, *overrides))
+
+
+def tiny_trainer(folder: Path, row: str = "rcdsac_pow", *overrides: str) -> Trainer:
+    """Make a tiny training, as the command line does."""
+    cfg = tiny_cfg(row, *overrides)
+    build.check_training(cfg)
+    return build.trainer(cfg, folder)
+
+
+def evaluate(*overrides: str) -> Path:
+    """Evaluate two episodes on one map, as the command line does; return where it wrote."""
+    given = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1", *overrides]
+    evaluation = build.evaluation(compose("evaluate", given))
+    evaluation.run()
+    return evaluation.out
+
+
+def evaluation_betas(row: str) -> list[float]:
+    """Return what an evaluation of a row must be told: some betas where it is risk-conditioned."""
+    if not row.startswith("rcdsac"):
+        return []
+    return [0.25, 1.0] if "cvar" in row else [-2.0, -1.0]
+
+
+def yaml_of(path: str) -> dict:
+    """Read one file of conf/."""
+    values: dict = yaml.safe_load((CONF_DIR / path).read_text())
+    return values
