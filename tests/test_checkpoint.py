@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.build.agent import make_loss, make_optimizer
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_manifest, load_weights
-from tiny import evaluation_betas, tiny_settings
+from tiny import tiny_settings
 
 PROGRESS = {"iteration": 3, "steps": 120, "updates": 8, "best_score": -1.25}
 
@@ -20,7 +20,8 @@ def make(seed: int, row: str = "rcdsac_pow") -> LossModule:
 
 
 def weights(loss: LossModule) -> dict[str, torch.Tensor]:
-    return {key: value.clone() for key, value in loss.state_dict().items() if isinstance(value, torch.Tensor)}
+    """Everything that is learnt; the generator's state, which drawing changes, has a test of its own."""
+    return {key: value.clone() for key, value in loss.state_dict().items() if "extra_state" not in key}
 
 
 def same(a: LossModule, b: LossModule) -> bool:
@@ -41,11 +42,11 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LossModule]:
 @pytest.mark.parametrize("row", ["rcdsac_pow", "rcwr"])
 def test_round_trip_restores_every_weight(tmp_path: Path, row: str) -> None:
     loss, other = make(0, row), make(1, row)
+    SoftUpdate(loss, tau=0.5)  # TorchRL warns of targets that nothing moves
     with torch.no_grad():  # targets and temperature of their own, so that mixing them up would show
-        for key, value in loss.named_parameters():
-            if "log_alpha" in key:
-                value.fill_(-0.75)
-        loss.target_critic_network_params.apply_(lambda value: value.mul_(0.5))
+        loss.log_alpha.fill_(-0.75)
+        for target in loss.target_critic_network_params.values(True, True):
+            target.mul_(0.5)
     Checkpoints(tmp_path, loss, make_optimizer(loss, tiny_settings(row).learner)).save("best", PROGRESS)
     assert not same(loss, other)
     assert load_weights(tmp_path, "best", other) == PROGRESS
@@ -58,15 +59,6 @@ def test_the_state_of_the_generator_comes_back(saved: tuple[Path, LossModule]) -
     other = make(seed=1)
     load_weights(folder, "last", other)
     assert torch.equal(torch.rand(3, generator=other._generator), torch.rand(3, generator=loss._generator))
-
-
-def test_loading_weights_asks_nothing_of_the_optimiser(saved: tuple[Path, LossModule]) -> None:
-    folder, loss = saved
-    other = make(seed=1)
-    before = torch.optim.Adam(other.parameters()).state_dict()
-    load_weights(folder, "last", other)
-    assert torch.optim.Adam(other.parameters()).state_dict() == before
-    assert same(other, loss)
 
 
 def test_saving_again_replaces(tmp_path: Path) -> None:
@@ -115,7 +107,6 @@ def test_a_training_leaves_best_and_last_with_their_progress(tiny_run: Path) -> 
         assert set(progress) == set(PROGRESS)
     assert load_manifest(tiny_run / "checkpoints", "last")["updates"] == 4
     assert load_manifest(tiny_run / "checkpoints", "last")["steps"] == 80
-    assert evaluation_betas("rcdsac_pow")
     trained = make_loss(tiny_settings(), "cpu")
     load_weights(tiny_run / "checkpoints", "last", trained)
     assert not same(trained, make_loss(tiny_settings(), "cpu")), "training changed the weights that were saved"

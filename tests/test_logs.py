@@ -72,7 +72,7 @@ def test_a_folder_holds_one_run(tmp_path: Path) -> None:
     start_run_folder(folder, tiny_cfg(), {"device": "cpu"})
     assert manifest(folder)["device"] == "cpu"
     written = (folder / "config.yaml").read_bytes()
-    with pytest.raises(UserInputError, match="already holds a run: choose another hydra.run.dir"):
+    with pytest.raises(UserInputError, match=r"already holds a run: choose another hydra\.run\.dir"):
         start_run_folder(folder, tiny_cfg("sac"), {})
     assert (folder / "config.yaml").read_bytes() == written
 
@@ -80,7 +80,7 @@ def test_a_folder_holds_one_run(tmp_path: Path) -> None:
 def test_unknown_backends_are_refused() -> None:
     check_backends(())
     check_backends(("csv", "tensorboard"))
-    with pytest.raises(UserInputError, match="logger.backends holds 'excel': choose among csv, tensorboard, wandb"):
+    with pytest.raises(UserInputError, match=r"logger\.backends holds 'excel': choose among csv, tensorboard, wandb"):
         check_backends(("csv", "excel"))
 
 
@@ -101,12 +101,11 @@ EXPECTED_SCALARS = {
 def test_csv_and_tensorboard_take_every_scalar_of_every_iteration(tiny_run: Path) -> None:
     steps = [(iteration + 1) * AGENTS * STEPS for iteration in range(ITERATIONS)]
 
-    tables = {path.relative_to(path.parents[1]): path for path in (tiny_run / "csv").rglob("*.csv")}
-    names = {"/".join(path.parts[-3:]).removesuffix(".csv") for path in tables.values()}
-    assert {name.partition("scalars/")[2] or name for name in names}
-    csv_root = next((tiny_run / "csv").rglob("scalars"))
-    found = {path.relative_to(csv_root).with_suffix("").as_posix(): path for path in csv_root.rglob("*.csv")}
-    assert {name.replace("_", "/") for name in found} == {name.replace("_", "/") for name in EXPECTED_SCALARS}
+    scalars = tiny_run / "csv" / "scalars"
+    assert {path.relative_to(scalars).with_suffix("").as_posix() for path in scalars.rglob("*.csv")} == EXPECTED_SCALARS
+    for name in EXPECTED_SCALARS:
+        rows = (scalars / f"{name}.csv").read_text().split()
+        assert [int(row.split(",")[0]) for row in rows] == steps, name
 
     events = EventAccumulator(str(tiny_run / "tensorboard"))
     events.Reload()

@@ -65,7 +65,7 @@ class MapSettings:
     layouts: tuple[str, ...] = LAYOUTS
     corridor_width_m: tuple[float, float] = (1.2, 2.4)
     door_width_m: tuple[float, float] = (0.9, 1.6)
-    clutter_per_m2: float = 0.15
+    clutter_per_m2: float = 0.07
     mapped_fraction: float = 0.5
     num_movers: int = 4
     mover_radius_m: tuple[float, float] = (0.2, 0.3)

@@ -1,0 +1,497 @@
+"""The training loop: what it counts, when it looks and saves, and that training is real, for every row."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.objectives import LossModule, SoftUpdate
+
+from rcdsac_trl.pipeline.build.agent import make_loss
+from rcdsac_trl.pipeline.checkpoint import load_manifest, load_weights
+from rcdsac_trl.pipeline.logs import RunLog
+from rcdsac_trl.pipeline.metrics import METRICS
+from rcdsac_trl.pipeline.settings import Schedule
+from rcdsac_trl.pipeline.trainer import LOSS_KEYS, Learner, Trainer
+from rcdsac_trl.world import episode
+from rcdsac_trl.world.env import NavigationEnv, make_env
+from rcdsac_trl.world.shapes import Map
+from tiny import AGENTS, ITERATIONS, ROWS, STEPS, UPDATES, evaluate, evaluation_betas, tiny_settings, tiny_trainer
+
+METRIC_COLUMNS = list(METRICS)
+
+
+# ------------------------------------------------------------------------------------------------ the loop, with stubs
+class Collector:
+    """Yields episodes whose reward says which iteration they are from."""
+
+    def __init__(self, events: list[Any]) -> None:
+        self.events = events
+
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        iteration = 0
+        while True:
+            self.events.append(("collect", iteration))
+            components = torch.zeros(1, 2, 4, 5)
+            components[..., 1] = iteration
+            flag = torch.zeros(1, 2, 4, 1, dtype=torch.bool)
+            after = {
+                "contact": flag,
+                "goal_reached": flag,
+                "reward_components": components,
+                "velocity": torch.zeros(1, 2, 4, 4),
+            }
+            risk = torch.tensor([-1.0, -2.0]).view(1, 2, 1, 1).expand(1, 2, 4, 1)
+            # One worker with two agents, four steps: [workers, agents, time].
+            yield TensorDict({"risk": risk, "next": after}, batch_size=[1, 2, 4])
+            iteration += 1
+
+    def shutdown(self, raise_on_error: bool = True) -> None:
+        assert not raise_on_error
+        self.events.append("collector closed")
+
+
+class StubLearner(Learner):
+    """Notes what it is asked for."""
+
+    def __init__(self, events: list[Any], interrupt_in: int | None = None) -> None:
+        self.events = events
+        self.interrupt_in = interrupt_in
+        self.calls = 0
+        self.replay = self  # type: ignore[assignment]
+
+    def add_episodes(self, episodes: TensorDictBase) -> None:
+        assert episodes.batch_size == torch.Size([2, 4])
+        self.events.append("store")
+
+    def updates(self, number: int, range_fraction: float) -> dict[str, float]:
+        if self.calls == self.interrupt_in:
+            raise KeyboardInterrupt
+        self.calls += 1
+        self.events.append(("update", number, range_fraction))
+        return {"loss_qvalue": 1.0}
+
+
+class StubValidation:
+    """Returns episodes of two conditions whose mean reward is the next of some scores."""
+
+    def __init__(self, events: list[Any], scores: Sequence[float]) -> None:
+        self.events = events
+        self.scores = iter(scores)
+
+    def __call__(self) -> pd.DataFrame:
+        score = next(self.scores)
+        self.events.append("validate")
+        rows = pd.DataFrame({"beta": [-2.0, -2.0, -1.0], "collision_weight": [math.nan] * 3})
+        # Conditions count alike, however many episodes they have.
+        rows[METRIC_COLUMNS] = 0.0
+        rows["reward"] = [score + 3.0, score - 1.0, score - 1.0]
+        return rows
+
+    def close(self) -> None:
+        self.events.append("validation closed")
+
+
+class StubCheckpoints:
+    """Notes what is saved."""
+
+    def __init__(self, events: list[Any]) -> None:
+        self.events = events
+
+    def save(self, name: str, progress: dict[str, Any]) -> Path:
+        self.events.append(("save", name, dict(progress)))
+        return Path(name)
+
+
+def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
+    schedule = {
+        "iterations": 5,
+        "updates_per_iteration": 3,
+        "pursuit_iterations": 0,
+        "pursuit_noise": 0.0,
+        "neutral_iterations": 1,
+        "widening_iterations": 2,
+    }
+    parts = {
+        "scores": range(100),
+        "validate_every": 1,
+        "checkpoint_every": 100,
+        "interrupt_in": None,
+    } | changes
+    return Trainer(
+        schedule=Schedule(**schedule | changes.get("schedule", {})),
+        collector=Collector(events),  # type: ignore[arg-type]
+        set_iteration=lambda iteration: events.append(("iteration", iteration)),
+        learner=StubLearner(events, parts["interrupt_in"]),
+        validate=StubValidation(events, parts["scores"]),  # type: ignore[arg-type]
+        validate_every=parts["validate_every"],
+        checkpoints=StubCheckpoints(events),  # type: ignore[arg-type]
+        checkpoint_every=parts["checkpoint_every"],
+        log=RunLog(folder, []),
+        context_key="risk",
+    )
+
+
+def kinds(events: list[Any], kind: str) -> list[Any]:
+    return [event for event in events if (event[0] if isinstance(event, tuple) else event) == kind]
+
+
+def test_an_iteration_collects_stores_updates_validates_and_saves_in_this_order(tmp_path: Path) -> None:
+    events: list[Any] = []
+    stub_trainer(tmp_path, events, schedule={"iterations": 1}).run()
+    names = [event if isinstance(event, str) else event[0] for event in events]
+    assert names == [
+        *("iteration", "collect", "store", "update", "validate", "save", "save"),
+        *("collector closed", "validation closed"),
+    ]
+
+
+def test_steps_and_updates_are_counted(tmp_path: Path) -> None:
+    events: list[Any] = []
+    trainer = stub_trainer(tmp_path, events, checkpoint_every=2)
+    trainer.run()
+    assert (trainer.steps, trainer.updates) == (5 * 2 * 4, 5 * 3)
+    saved = [event[2] for event in kinds(events, "save") if event[1] == "last"]
+    assert [(progress["iteration"], progress["steps"], progress["updates"]) for progress in saved] == [
+        (1, 16, 6),
+        (3, 32, 12),
+        (4, 40, 15),
+    ]
+
+
+def test_each_iteration_is_told_before_its_episodes_and_its_updates_get_the_open_range(tmp_path: Path) -> None:
+    events: list[Any] = []
+    stub_trainer(tmp_path, events).run()
+    assert [event[1] for event in kinds(events, "iteration")] == [0, 1, 2, 3, 4]
+    told = [event for event in events if event[0] in ("iteration", "collect")]
+    assert told == [(kind, iteration) for iteration in range(5) for kind in ("iteration", "collect")]
+    # one neutral iteration, then two that widen
+    assert [event[1:] for event in kinds(events, "update")] == [(3, 0.0), (3, 0.5), (3, 1.0), (3, 1.0), (3, 1.0)]
+
+
+@pytest.mark.parametrize(("every", "validated"), [(1, 5), (2, 3), (5, 1), (50, 1)])
+def test_validation_comes_every_so_often_and_at_the_end(tmp_path: Path, every: int, validated: int) -> None:
+    events: list[Any] = []
+    stub_trainer(tmp_path, events, validate_every=every).run()
+    assert len(kinds(events, "validate")) == validated
+
+
+def test_best_is_the_highest_validation_score(tmp_path: Path) -> None:
+    events: list[Any] = []
+    trainer = stub_trainer(tmp_path, events, scores=[-50.0, -20.0, -30.0, -20.0, -10.0])
+    trainer.run()
+    best = [event[2] for event in kinds(events, "save") if event[1] == "best"]
+    # An equal score is no better: the earlier agent stays.
+    assert [progress["iteration"] for progress in best] == [0, 1, 4]
+    assert [progress["best_score"] for progress in best] == [-50.0, -20.0, -10.0]
+    assert trainer.best_score == -10.0
+
+
+def test_ctrl_c_saves_the_last_agent_and_closes_everything(tmp_path: Path) -> None:
+    events: list[Any] = []
+    trainer = stub_trainer(tmp_path, events, interrupt_in=2, validate_every=100)
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run()
+    assert kinds(events, "save") == [
+        ("save", "last", {"iteration": 2, "steps": 24, "updates": 6, "best_score": -math.inf})
+    ]
+    assert events[-2:] == ["collector closed", "validation closed"]
+    assert "interrupted in iteration 2: save and stop" in (tmp_path / "train.log").read_text()
+    assert len(pd.read_csv(tmp_path / "training_episodes.csv")) == 3 * 2
+
+
+def test_training_episodes_stand_under_the_updates_they_were_driven_with(tmp_path: Path) -> None:
+    stub_trainer(tmp_path, [], schedule={"iterations": 2}).run()
+    rows = pd.read_csv(tmp_path / "training_episodes.csv")
+    assert list(rows) == ["iteration", "updates", "episode", "risk", *METRICS]
+    assert rows["iteration"].tolist() == [0, 0, 1, 1]
+    assert rows["updates"].tolist() == [0, 0, 3, 3]
+    assert rows["episode"].tolist() == [0, 1, 0, 1]
+    assert rows["risk"].tolist() == [-1.0, -2.0, -1.0, -2.0]
+    assert rows["reward"].tolist() == [0.0, 0.0, 4.0, 4.0]
+
+
+def test_validation_episodes_stand_under_the_updates_before_them(tmp_path: Path) -> None:
+    stub_trainer(tmp_path, [], schedule={"iterations": 2}, scores=[5.0, 6.0]).run()
+    rows = pd.read_csv(tmp_path / "validation_episodes.csv")
+    assert list(rows) == ["iteration", "updates", "beta", "collision_weight", *METRICS]
+    assert rows["updates"].tolist() == [3, 3, 3, 6, 6, 6]
+    assert rows["reward"].tolist() == [8.0, 4.0, 4.0, 9.0, 5.0, 5.0]
+
+
+def test_losses_are_averaged_over_the_updates() -> None:
+    class Counting(Learner):
+        def __init__(self) -> None:
+            self.value = 0.0
+            self.fractions: list[float] = []
+
+        def update(self, range_fraction: float) -> dict[str, torch.Tensor]:
+            self.value += 1.0
+            self.fractions.append(range_fraction)
+            return {"a": torch.tensor(self.value), "b": torch.tensor(-self.value)}
+
+    learner = Counting()
+    assert learner.updates(4, 0.5) == {"a": 2.5, "b": -2.5}
+    assert learner.fractions == [0.5] * 4
+    assert learner.updates(0, 0.5) == {}
+
+
+# ------------------------------------------------------------------------------------------------ every row, for real
+def fresh_loss(row: str = "rcdsac_pow", *overrides: str) -> LossModule:
+    """Return the loss that a training of a row begins with."""
+    loss = make_loss(tiny_settings(row, *overrides), "cpu")
+    SoftUpdate(loss, tau=0.001)  # TorchRL warns of targets that nothing moves
+    return loss
+
+
+def networks(loss: LossModule) -> dict[str, torch.Tensor]:
+    """Every weight by its name: those of actor, critics and their targets, and the temperature."""
+    parts = {
+        "actor": loss.actor_network_params,
+        "critic": loss.critic_network_params,
+        "target": loss.target_critic_network_params,
+    }
+    named = {
+        f"{part}/{'/'.join(key)}": value for part, params in parts.items() for key, value in params.items(True, True)
+    } | {"alpha": loss.log_alpha}
+    # Constants, such as the frequencies of the cosines, are no weights.
+    learnt = {name for name, value in named.items() if isinstance(value, torch.nn.Parameter)}
+    learnt |= {name for name in named if name.replace("target/", "critic/") in learnt}
+    return {name: named[name].detach().clone() for name in sorted(learnt)}
+
+
+@pytest.fixture(scope="module", params=ROWS)
+def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Trainer]:
+    """A finished tiny training of each row."""
+    folder = tmp_path_factory.mktemp(request.param) / "run"
+    trainer = tiny_trainer(folder, request.param)
+    trainer.run()
+    return request.param, folder, trainer
+
+
+def test_training_changes_every_network(trained: tuple[str, Path, Trainer]) -> None:
+    row, _, trainer = trained
+    before = networks(fresh_loss(row))
+    after = networks(trainer.learner.loss)
+    assert before.keys() == after.keys()
+    unchanged = [name for name in before if torch.equal(before[name], after[name])]
+    assert unchanged == []
+    assert all(value.isfinite().all() for value in after.values())
+
+
+def test_an_update_moves_each_network_by_its_own_rule(trained: tuple[str, Path, Trainer]) -> None:
+    row, _, trainer = trained
+    learner = trainer.learner
+    before = networks(learner.loss)
+    losses = learner.update(1.0)
+    after = networks(learner.loss)
+    assert set(LOSS_KEYS) <= set(losses)
+    assert all(value.isfinite().all() and not value.requires_grad for value in losses.values())
+    assert all(parameter.grad is None for group in learner.optimizer.param_groups for parameter in group["params"])
+
+    settings = tiny_settings(row).learner
+    rates = {"actor": settings.actor_lr, "critic": settings.critic_lr, "alpha": settings.alpha_lr}
+    for name in before:
+        part = name.split("/")[0]
+        if part == "target":  # moves by the coefficient towards what the critic has just become
+            online = after[name.replace("target/", "critic/")]
+            expected = before[name].lerp(online, settings.target_coefficient)
+            torch.testing.assert_close(after[name], expected, rtol=0, atol=1e-7)
+        else:  # Adam's steps are of the learning rate's size, and no larger for long
+            step = (after[name] - before[name]).abs().max().item()
+            assert 0 < step < 3 * rates[part], name
+
+
+def test_a_run_evaluates(trained: tuple[str, Path, Trainer]) -> None:
+    row, folder, _ = trained
+    betas = evaluation_betas(row)
+    out = evaluate(f"run={folder}", *([f"beta={betas}"] if betas else []))
+    episodes = pd.read_csv(out / "episodes.csv")
+    conditions = len(betas) or len(tiny_settings(row).algo.default_conditions)
+    assert len(episodes) == conditions * 2
+    assert episodes[METRIC_COLUMNS].notna().all(axis=None)
+
+
+def test_a_run_logs_what_its_row_tells(trained: tuple[str, Path, Trainer]) -> None:
+    row, folder, _ = trained
+    algo = tiny_settings(row).algo
+    training = pd.read_csv(folder / "training_episodes.csv")
+    told = [algo.context_key] if algo.context_key else []
+    assert list(training) == ["iteration", "updates", "episode", *told, *METRICS]
+    assert len(training) == ITERATIONS * AGENTS
+    validation = pd.read_csv(folder / "validation_episodes.csv")
+    assert list(validation) == ["iteration", "updates", "beta", "collision_weight", "map", "episode", *METRICS]
+    assert len(validation) == ITERATIONS * len(algo.default_conditions) * AGENTS
+    seen = validation[["beta", "collision_weight"]].drop_duplicates().astype(object).where(pd.notna, None)
+    asked = [(c.beta, c.collision_weight) for c in algo.default_conditions]
+    assert sorted(map(tuple, seen.to_numpy().tolist()), key=str) == sorted(asked, key=str)
+
+
+def test_collected_betas_and_weights_lie_in_the_open_range(trained: tuple[str, Path, Trainer]) -> None:
+    row, folder, _ = trained
+    algo = tiny_settings(row).algo
+    training = pd.read_csv(folder / "training_episodes.csv")
+    first, second = (training[training["iteration"] == i] for i in (0, 1))
+    if algo.context_key == "risk":  # the smoke schedule: one neutral iteration, then the whole range
+        measure = algo.distortion.measure
+        assert (first["risk"] == measure.neutral_beta).all()
+        assert second["risk"].between(measure.low, measure.high).all()
+        assert second["risk"].nunique() == AGENTS
+    elif algo.collision_weight is not None:
+        weights = training["collision_weight"]
+        assert weights.between(*algo.collision_weight).all()
+        assert weights.nunique() == AGENTS * ITERATIONS
+
+
+@pytest.mark.parametrize("row", ["rcdsac_pow", "rcwr"])
+def test_gradients_are_clipped_per_network(tmp_path: Path, row: str) -> None:
+    limit = 1e-3
+    trainer = tiny_trainer(tmp_path, row, f"learner.max_grad_norm={limit}", "schedule.iterations=1")
+    optimizer, norms = trainer.learner.optimizer, []
+    step = optimizer.step
+
+    def watched_step() -> None:
+        groups = [[p.grad.flatten() for p in group["params"]] for group in optimizer.param_groups]
+        norms.append([torch.cat(group).norm().item() for group in groups])
+        step()
+
+    optimizer.step = watched_step  # type: ignore[method-assign, assignment]
+    trainer.run()
+    assert len(norms) == UPDATES
+    for actor, critics, alpha in norms:
+        assert actor == pytest.approx(limit, rel=1e-3)
+        assert critics == pytest.approx(limit, rel=1e-3)
+        assert alpha > limit  # a single number needs no clipping
+
+
+# ------------------------------------------------------------------------------------------------ repeatability
+def saved_weights(run: Path, *overrides: str) -> dict[str, torch.Tensor]:
+    loss = fresh_loss("rcdsac_pow", *overrides)
+    load_weights(run / "checkpoints", "last", loss)
+    return networks(loss)
+
+
+def assert_equal_runs(first: Path, second: Path) -> None:
+    for table in ("training_episodes.csv", "validation_episodes.csv"):
+        assert (first / table).read_bytes() == (second / table).read_bytes(), table
+    a, b = saved_weights(first), saved_weights(second)
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_the_same_seed_gives_the_same_run_bit_for_bit(tiny_run: Path, tmp_path: Path) -> None:
+    torch.manual_seed(99)  # the global generator has no say
+    tiny_trainer(tmp_path / "again").run()
+    assert_equal_runs(tiny_run, tmp_path / "again")
+
+
+def test_another_seed_gives_another_run(tiny_run: Path, tmp_path: Path) -> None:
+    tiny_trainer(tmp_path / "other", "rcdsac_pow", "seed=1").run()
+    table = "training_episodes.csv"
+    assert (tiny_run / table).read_bytes() != (tmp_path / "other" / table).read_bytes()
+    a, b = saved_weights(tiny_run), saved_weights(tmp_path / "other", "seed=1")
+    assert not any(torch.equal(a[name], b[name]) for name in a if value_varies(a[name]))
+
+
+def value_varies(value: torch.Tensor) -> bool:
+    return bool((value != value.flatten()[0]).any())
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_do_not_change_a_run(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    """Workers in this process: the same code with the same shapes, without the time that processes take."""
+    monkeypatch.setattr("rcdsac_trl.pipeline.build.world.make_env", partial(make_env, serial=True))
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", f"world.num_workers={workers}")
+    assert trainer.collector.env.batch_size == torch.Size([workers, AGENTS // workers])
+    trainer.run()
+    assert_equal_runs(tiny_run, tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_worker_processes_do_not_change_a_run(tiny_run: Path, tmp_path: Path) -> None:
+    tiny_trainer(tmp_path / "run", "rcdsac_pow", "world.num_workers=2").run()
+    assert_equal_runs(tiny_run, tmp_path / "run")
+
+
+# ------------------------------------------------------------------------------------------------ maps and episodes
+Spied = list[tuple[str, int, int, Map]]
+
+
+@pytest.fixture
+def spied_maps(monkeypatch: pytest.MonkeyPatch) -> Iterator[Spied]:
+    """Every map that is generated: split, seed, index and the map itself."""
+    seen: Spied = []
+    original: Callable[..., Map] = episode.generate_map
+
+    def spy(settings: Any, split: str, seed: int, index: int) -> Map:
+        map_ = original(settings, split, seed, index)
+        seen.append((split, seed, index, map_))
+        return map_
+
+    episode.load_map.cache_clear()
+    monkeypatch.setattr(episode, "generate_map", spy)
+    yield seen
+    episode.load_map.cache_clear()
+
+
+def test_training_maps_are_never_validated_or_evaluated_on(tmp_path: Path, spied_maps: Spied) -> None:
+    tiny_trainer(tmp_path / "run", "rcdsac_pow", "seed=0").run()
+    training = {(split, seed) for split, seed, _, _ in spied_maps if split == "train"}
+    validation = {(split, seed) for split, seed, _, _ in spied_maps if split != "train"}
+    assert (training, validation) == ({("train", 0)}, {("validation", 0)})
+    of_training = [entry for entry in spied_maps if entry[0] == "train"]
+    before = len(spied_maps)
+    # Even with the run's own seed the evaluation's maps are others, because the split is in their stream.
+    evaluate(f"run={tmp_path / 'run'}", "beta=[-1]", "seed=0", "num_maps=2")
+    of_evaluation = spied_maps[before:]
+    assert {(split, seed) for split, seed, _, _ in of_evaluation} == {("evaluation", 0)}
+    assert {index for _, _, index, _ in of_evaluation} >= {0, 1}
+
+    def texts(entries: Spied) -> set[str]:
+        return {str(map_.to_json()) for _, _, _, map_ in entries}
+
+    assert texts(of_training).isdisjoint(texts([entry for entry in spied_maps if entry[0] != "train"]))
+
+
+def test_every_validation_sees_the_same_maps_whatever_the_seed_of_the_run(tmp_path: Path, spied_maps: Spied) -> None:
+    for seed in (3, 4):
+        tiny_trainer(tmp_path / str(seed), "sac", f"seed={seed}", "validation.num_maps=2").run()
+    looked_at = {(seed, index) for split, seed, index, _ in spied_maps if split == "validation"}
+    assert looked_at == {(0, 0), (0, 1)}
+
+
+def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: Path) -> None:
+    settings = tiny_settings()
+    trainer = tiny_trainer(tmp_path / "run")
+    for iteration, batch in enumerate(trainer.collector):
+        assert batch.batch_size == torch.Size([AGENTS, STEPS])
+        fresh = NavigationEnv(settings.map, settings.task, seed=0, agent_ids=range(AGENTS), first_episode=iteration)
+        start = fresh.reset()
+        for key in ("pose", "range", "waypoint", "velocity"):
+            assert torch.equal(batch[key][:, 0], start[key]), key
+        fresh.close()
+        # Nobody terminates, and only the time limit truncates.
+        assert not batch["next", "terminated"].any()
+        assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * (STEPS - 1) + [True]] * AGENTS
+        # What is told stays for the whole episode.
+        assert (batch["risk"] == batch["risk"][:, :1]).all()
+    trainer.collector.shutdown()
+    trainer.validate.close()
+    trainer.log.close()
+
+
+def test_progress_is_saved_with_the_weights(tiny_run: Path) -> None:
+    progress = load_manifest(tiny_run / "checkpoints", "last")
+    assert progress["iteration"] == ITERATIONS - 1
+    assert progress["steps"] == ITERATIONS * AGENTS * STEPS
+    assert progress["updates"] == ITERATIONS * UPDATES
+    validation = pd.read_csv(tiny_run / "validation_episodes.csv")
+    scores = validation.groupby("iteration")["reward"].mean()
+    assert progress["best_score"] == pytest.approx(scores.max(), rel=1e-4)
+    assert load_manifest(tiny_run / "checkpoints", "best")["iteration"] == scores.idxmax()
