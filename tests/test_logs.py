@@ -85,7 +85,7 @@ def test_unknown_backends_are_refused() -> None:
 
 
 EXPECTED_SCALARS = {
-    *(f"train/{metric}" for metric in METRICS),
+    *(f"train/{metric}{half}" for metric in METRICS for half in ("", "/low_beta", "/high_beta")),
     *(f"validation/{metric}/{beta}" for metric in METRICS for beta in ("-2", "-1.5", "-1", "-0.5")),
     "validation/score",
     *(f"learn/loss_{name}" for name in ("qvalue", "actor", "alpha")),

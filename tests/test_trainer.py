@@ -38,7 +38,8 @@ class Collector:
         while True:
             self.events.append(("collect", iteration))
             components = torch.zeros(1, 2, 4, 5)
-            components[..., 1] = iteration
+            components[:, 0, :, 1] = iteration
+            components[:, 1, :, 1] = 10.0 * iteration
             flag = torch.zeros(1, 2, 4, 1, dtype=torch.bool)
             after = {
                 "contact": flag,
@@ -208,12 +209,26 @@ def test_ctrl_c_saves_the_last_agent_and_closes_everything(tmp_path: Path) -> No
 def test_training_episodes_stand_under_the_updates_they_were_driven_with(tmp_path: Path) -> None:
     stub_trainer(tmp_path, [], schedule={"iterations": 2}).run()
     rows = pd.read_csv(tmp_path / "training_episodes.csv")
-    assert list(rows) == ["iteration", "updates", "episode", "risk", *METRICS]
+    assert list(rows) == ["iteration", "updates", "episode", "beta", *METRICS]
     assert rows["iteration"].tolist() == [0, 0, 1, 1]
     assert rows["updates"].tolist() == [0, 0, 3, 3]
     assert rows["episode"].tolist() == [0, 1, 0, 1]
-    assert rows["risk"].tolist() == [-1.0, -2.0, -1.0, -2.0]
-    assert rows["reward"].tolist() == [0.0, 0.0, 4.0, 4.0]
+    assert rows["beta"].tolist() == [-1.0, -2.0, -1.0, -2.0]
+    assert rows["reward"].tolist() == [0.0, 0.0, 4.0, 40.0]
+
+
+def test_training_metrics_are_logged_for_all_and_for_each_half_of_beta(tmp_path: Path) -> None:
+    trainer = stub_trainer(tmp_path, [], schedule={"iterations": 2})
+    records: list[dict[str, float]] = []
+    trainer.log.scalars = lambda values, step: records.append({"step": step, **values})  # type: ignore[method-assign]
+    trainer.run()
+    # Of the two agents the averse one (beta -2) is the second, whose reward is 40 in iteration 1.
+    reward = [
+        {key.partition("reward")[2]: record[key] for key in record if "train/reward" in key} for record in records
+    ]
+    assert reward[0] == {"": 0.0, "/low_beta": 0.0, "/high_beta": 0.0}
+    assert reward[1] == {"": 22.0, "/low_beta": 40.0, "/high_beta": 4.0}
+    assert [record["step"] for record in records] == [8, 16]
 
 
 def test_validation_episodes_stand_under_the_updates_before_them(tmp_path: Path) -> None:
@@ -321,7 +336,7 @@ def test_a_run_logs_what_its_row_tells(trained: tuple[str, Path, Trainer]) -> No
     row, folder, _ = trained
     algo = tiny_settings(row).algo
     training = pd.read_csv(folder / "training_episodes.csv")
-    told = [algo.context_key] if algo.context_key else []
+    told = {"risk": ["beta"], "collision_weight": ["collision_weight"], None: []}[algo.context_key]
     assert list(training) == ["iteration", "updates", "episode", *told, *METRICS]
     assert len(training) == ITERATIONS * AGENTS
     validation = pd.read_csv(folder / "validation_episodes.csv")
@@ -339,9 +354,9 @@ def test_collected_betas_and_weights_lie_in_the_open_range(trained: tuple[str, P
     first, second = (training[training["iteration"] == i] for i in (0, 1))
     if algo.context_key == "risk":  # the smoke schedule: one neutral iteration, then the whole range
         measure = algo.distortion.measure
-        assert (first["risk"] == measure.neutral_beta).all()
-        assert second["risk"].between(measure.low, measure.high).all()
-        assert second["risk"].nunique() == AGENTS
+        assert (first["beta"] == measure.neutral_beta).all()
+        assert second["beta"].between(measure.low, measure.high).all()
+        assert second["beta"].nunique() == AGENTS
     elif algo.collision_weight is not None:
         weights = training["collision_weight"]
         assert weights.between(*algo.collision_weight).all()

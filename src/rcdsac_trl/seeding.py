@@ -39,8 +39,6 @@ def torch_seed(seed: int, purpose: str, *index: int) -> int:
     return int(seed_sequence(seed, purpose, *index).generate_state(1, np.uint64)[0] >> 1)
 
 
-def torch_stream(
-    seed: int, purpose: str, *index: int, device: torch.device | str = "cpu"
-) -> torch.Generator:
+def torch_stream(seed: int, purpose: str, *index: int, device: torch.device | str = "cpu") -> torch.Generator:
     """Return a torch generator for one purpose; see :func:`seed_sequence`."""
     return torch.Generator(device=device).manual_seed(torch_seed(seed, purpose, *index))

@@ -58,6 +58,7 @@ def build_actor(
         ``[B, T, 1]``) to ``loc`` and ``scale`` ``[B, T, action_size]``.
 
     Example:
+        >>> from rcdsac_trl.agent.risk import CVaR
         >>> actor = build_actor(measure=CVaR())
         >>> actor.in_keys
         ['range', 'waypoint', 'velocity', 'risk']

@@ -77,13 +77,22 @@ class DistributionalSACLoss(LossModule):
         generator: source of all random numbers; None for one seeded with 0. Its state is part of ``state_dict``.
 
     Example:
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from rcdsac_trl.agent.actor import build_actor, build_critic
+        >>> from rcdsac_trl.agent.risk import PowerLaw
         >>> measure = PowerLaw()
-        >>> loss = DistributionalSACLoss(
-        ...     build_actor(measure=measure), [build_critic(measure=measure) for _ in range(2)], measure=measure
-        ... ).make_value_estimator(gamma=0.99)
-        >>> updater = SoftUpdate(loss, eps=0.999)
+        >>> critics = [build_critic(measure=measure) for _ in range(2)]
+        >>> loss = DistributionalSACLoss(build_actor(measure=measure), critics, measure=measure)
+        >>> loss = loss.make_value_estimator(gamma=0.99)
+        >>> targets = SoftUpdate(loss, tau=0.005)
+        >>> observations = {"range": torch.zeros(3, 9, 180), "waypoint": torch.zeros(3, 9, 6)}
+        >>> observations["velocity"] = torch.zeros(3, 9, 4)
+        >>> outcome = {"reward": torch.zeros(3, 9, 1), "terminated": torch.zeros(3, 9, 1, dtype=torch.bool)}
+        >>> batch = TensorDict({**observations, "next": outcome}, batch_size=[3, 9])
+        >>> batch["action"], batch["risk"] = torch.zeros(3, 9, 2), torch.full((3, 9, 1), -1.0)
         >>> losses = loss(batch)
         >>> (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+        >>> targets.step()
     """
 
     @dataclass

@@ -34,9 +34,11 @@ class EpisodeSampler(Transform):
         fixed: one number for each agent, told in every episode instead of a draw.
 
     Example:
-        >>> sampler = EpisodeSampler("risk", lambda u, episode: -2.0 * u, seed=0, agent_ids=range(10))
-        >>> TransformedEnv(make_env(num_workers=0), sampler).reset()["risk"].shape
-        torch.Size([10, 1])
+        >>> from torchrl.envs import TransformedEnv
+        >>> from rcdsac_trl.world.env import make_env
+        >>> sampler = EpisodeSampler("risk", lambda u, episode: -2.0 * u, seed=0, agent_ids=range(2))
+        >>> TransformedEnv(make_env(num_workers=0, agent_ids=range(2)), sampler).reset()["risk"].shape
+        torch.Size([2, 1])
     """
 
     def __init__(
@@ -103,6 +105,8 @@ class Relabel:
         generator: source of the draws, on the batch's device (resample only).
 
     Example:
+        >>> from tensordict import TensorDict
+        >>> from rcdsac_trl.agent.risk import PowerLaw
         >>> relabel = Relabel(PowerLaw(), mode="resample", generator=torch.Generator().manual_seed(0))
         >>> relabel(TensorDict(batch_size=[3, 9]))["risk"].shape
         torch.Size([3, 9, 1])

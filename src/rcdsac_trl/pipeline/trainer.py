@@ -181,13 +181,20 @@ class Trainer:
     def _training_record(self, iteration: int, batch: TensorDictBase) -> dict[str, float]:
         metrics = episode_metrics(batch)
         rows = pd.DataFrame({key: value.numpy() for key, value in metrics.items()})
+        record = {f"train/{metric}": float(rows[metric].mean()) for metric in METRICS}
         if self.context_key is not None:
-            rows.insert(0, self.context_key, batch[self.context_key][:, 0, 0].cpu().numpy())
+            told = "beta" if self.context_key == "risk" else self.context_key
+            rows.insert(0, told, batch[self.context_key][:, 0, 0].cpu().numpy())
+            # Each half by itself: the mean over all betas hides an averse half that stands still.
+            in_order = rows.sort_values(told)
+            halves = {"low": in_order[: len(rows) // 2], "high": in_order[len(rows) // 2 :]}
+            for half, part in halves.items():
+                record |= {f"train/{metric}/{half}_{told}": float(part[metric].mean()) for metric in METRICS}
         rows.insert(0, "episode", range(len(rows)))
         rows.insert(0, "iteration", iteration)
         rows.insert(1, "updates", self.updates)
         self.log.episodes("training", rows)
-        return {f"train/{metric}": float(rows[metric].mean()) for metric in METRICS}
+        return record
 
     def _validate(self, iteration: int) -> dict[str, float]:
         rows = self.validate()

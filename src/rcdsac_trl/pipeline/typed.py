@@ -30,6 +30,7 @@ def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> S
         UserInputError: for an unknown or missing key, a value of another type, and what the dataclass refuses.
 
     Example:
+        >>> from dataclasses import dataclass
         >>> @dataclass
         ... class Lens:
         ...     focus_m: float

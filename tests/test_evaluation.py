@@ -1,0 +1,401 @@
+"""Evaluation: the same maps for everyone, deterministic actions, the same files twice, numbers that add up."""
+
+import importlib
+import json
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline import build, evaluation
+from rcdsac_trl.pipeline.build.agent import make_loss, make_optimizer
+from rcdsac_trl.pipeline.build.world import evaluation_environment
+from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_manifest, load_weights
+from rcdsac_trl.pipeline.cli import compose
+from rcdsac_trl.pipeline.evaluation import EvaluationRun, run_episodes
+from rcdsac_trl.pipeline.metrics import METRICS, Condition
+from rcdsac_trl.pipeline.policies import PursuitPolicy
+from rcdsac_trl.pipeline.settings import WorldSettings
+from rcdsac_trl.world.env import make_env
+from tiny import evaluate, tiny_settings, tiny_trainer
+
+FILES = ("episodes.csv", "summary.csv", "evaluation.json")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+@pytest.fixture(scope="module")
+def run(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of this module's own, since evaluations write into it."""
+    folder = tmp_path_factory.mktemp("evaluated") / "run"
+    shutil.copytree(tiny_run, folder)
+    return folder
+
+
+# ------------------------------------------------------------------------------------------------ files
+def test_the_same_run_evaluated_twice_gives_identical_files(run: Path, tmp_path: Path) -> None:
+    given = [f"run={run}", "beta=[-2,-1]", "num_maps=2"]
+    first = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
+    torch.manual_seed(7)
+    second = contents(evaluate(*given, f"out={tmp_path / 'b'}"))
+    assert first == second
+    # Over the first files as well, which are its own.
+    assert contents(evaluate(*given, f"out={tmp_path / 'a'}")) == first
+
+
+def test_workers_do_not_change_an_evaluation(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = [f"run={run}", "beta=[-2,-1]"]
+    alone = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
+    monkeypatch.setattr("rcdsac_trl.pipeline.build.world.make_env", partial(make_env, serial=True))
+    assert contents(evaluate(*given, f"out={tmp_path / 'b'}", "num_workers=2")) == alone
+
+
+def test_another_seed_split_or_agent_gives_other_episodes(run: Path, tmp_path: Path) -> None:
+    given = [f"run={run}", "beta=[-1]"]
+    others = {
+        "plain": [],
+        "seed": ["seed=1"],
+        "split": ["split=validation"],
+        "sampled": ["sampled=true"],
+        "beta": ["beta=[-2]"],
+        "map": ["map=static"],
+    }
+    found = {
+        contents(evaluate(*given, *more, f"out={tmp_path / name}"))["episodes.csv"] for name, more in others.items()
+    }
+    assert len(found) == len(others)
+
+
+def test_sampled_actions_repeat_too(run: Path, tmp_path: Path) -> None:
+    given = [f"run={run}", "beta=[-1]", "sampled=true"]
+    first = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
+    assert contents(evaluate(*given, f"out={tmp_path / 'b'}")) == first
+
+
+def test_it_refuses_to_overwrite_another_evaluation(run: Path, tmp_path: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
+    before = contents(out)
+    for other in (["beta=[-2]"], ["beta=[-1]", "seed=1"], ["beta=[-1]", "checkpoint=last"]):
+        with pytest.raises(
+            UserInputError, match="holds an evaluation of something else: give another folder with out="
+        ):
+            evaluate(f"run={run}", *other, f"out={out}")
+    assert contents(out) == before
+
+
+def test_results_go_beside_the_run_unless_told_otherwise(run: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-1]", "seed=5", "checkpoint=last")
+    assert out == run / "evaluation" / "last-evaluation-seed5-1x2"
+    assert contents(out)
+
+
+def test_the_description_says_what_was_measured(run: Path, tmp_path: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-2,-0.5]", f"out={tmp_path / 'out'}")
+    described = json.loads((out / "evaluation.json").read_text())
+    expected = {
+        "agent": "rcdsac_pow",
+        "measure": "pow",
+        "sensor": "narrow",
+        "checkpoint": "best",
+        "split": "evaluation",
+        "seed": 0,
+        "num_maps": 1,
+        "num_episodes": 2,
+        "sampled": False,
+        "conditions": ["beta=-2", "beta=-0.5"],
+    }
+    assert {key: described[key] for key in expected} == expected
+    assert described["map"]["size_m"] == 10
+    assert described["task"]["episode_steps"] == 20
+
+
+def test_nothing_is_written_when_it_is_stopped(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluation, "run_episodes", stop)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------------------------------------ numbers
+def test_rows_and_summary_add_up(run: Path, tmp_path: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-1,-2]", "num_maps=2", "num_episodes=3", f"out={tmp_path / 'out'}")
+    episodes, summary = pd.read_csv(out / "episodes.csv"), pd.read_csv(out / "summary.csv")
+    assert list(episodes) == ["beta", "collision_weight", "map", "episode", *METRICS]
+    keys = list(episodes[["beta", "map", "episode"]].itertuples(index=False, name=None))
+    assert keys == [(beta, map_, i) for beta in (-2.0, -1.0) for map_ in (0, 1) for i in range(3)]
+    assert summary["beta"].tolist() == [-2.0, -1.0]
+    assert summary["episodes"].tolist() == [6, 6]
+    for _, line in summary.iterrows():
+        of_beta = episodes[episodes["beta"] == line["beta"]]
+        for metric in METRICS:
+            values = of_beta[metric].tolist()
+            mean = sum(values) / 6
+            spread = (sum((value - mean) ** 2 for value in values) / 6) ** 0.5
+            assert line[f"{metric}_mean"] == pytest.approx(mean, rel=1e-4, abs=1e-6)
+            assert line[f"{metric}_std"] == pytest.approx(spread, rel=1e-3, abs=1e-5)
+
+
+def test_fractions_and_counts_are_possible_numbers(run: Path, tmp_path: Path) -> None:
+    episodes = pd.read_csv(evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}") / "episodes.csv")
+    assert (episodes["collisions"] % 1 == 0).all()
+    assert episodes["contact_fraction"].between(0, 1).all()
+    assert (episodes["contact_fraction"] * 20 >= episodes["collisions"] - 1e-6).all()
+    assert episodes["mean_speed_m_per_s"].between(0, 0.7).all()
+
+
+class Hits(EnvBase):
+    """Every agent collides in its second step; the reward the agents are paid is scaled by their weight."""
+
+    def __init__(self, num_agents: int) -> None:
+        super().__init__(batch_size=[num_agents])
+        self.count = 0
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        self.count = 0
+        return TensorDict({"done": torch.zeros(*self.batch_size, 1, dtype=torch.bool)}, batch_size=self.batch_size)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.count += 1
+        hit = self.count == 2
+        number = self.batch_size[0]
+        components = torch.tensor([-0.02, 0.0, 0.5, 1.2, -10.0 if hit else 0.0]).expand(number, 5)
+        return TensorDict(
+            {
+                "contact": torch.full((number, 1), hit),
+                "goal_reached": torch.zeros(number, 1, dtype=torch.bool),
+                "reward_components": components,
+                "velocity": torch.full((number, 4), -0.1),
+                "reward": torch.full((number, 1), 1e6),
+                "done": torch.zeros(number, 1, dtype=torch.bool),
+                "terminated": torch.zeros(number, 1, dtype=torch.bool),
+            },
+            batch_size=self.batch_size,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+class Nothing(TensorDictModuleBase):
+    """Drives nowhere, and notes how actions are chosen."""
+
+    in_keys = ["done"]  # noqa: RUF012
+    out_keys = ["action"]  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kinds: set[Any] = set()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.kinds.add(exploration_type())
+        assert not torch.is_grad_enabled()
+        return tensordict.set("action", torch.zeros(*tensordict.batch_size, 2))
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_table_of_known_episodes(sampled: bool) -> None:
+    conditions = [Condition(collision_weight=2.0), Condition(collision_weight=1.0)]
+    policy, done = Nothing(), []
+    table = evaluation.evaluate(
+        Hits(4),
+        policy,
+        conditions=conditions,
+        num_agents=2,
+        num_maps=3,
+        steps=4,
+        sampled=sampled,
+        on_map=done.append,
+    )
+    assert policy.kinds == {ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC}
+    assert done == [1, 2, 3]
+    assert len(table) == 2 * 3 * 2
+    assert table["collision_weight"].tolist() == [1.0] * 6 + [2.0] * 6  # sorted, whatever order was asked for
+    assert table["beta"].isna().all()
+    # 4 x (-0.02 + 0.5 x 1.2) - 10, with a weight of 1 for both conditions: what was paid is not what is reported
+    assert table["reward"].to_numpy() == pytest.approx(4 * 0.58 - 10.0)
+    assert (table["collisions"] == 1).all()
+    assert (table["contact_fraction"] == 0.25).all()
+    assert table["mean_speed_m_per_s"].to_numpy() == pytest.approx(0.1)
+
+
+def test_the_weighted_row_is_paid_with_its_weight_and_reported_without(tmp_path: Path) -> None:
+    """RCWR's reward column must compare with every other row's: w_coll is 1 there."""
+    settings = tiny_settings("rcwr")
+    conditions = [Condition(collision_weight=0.5), Condition(collision_weight=2.0)]
+    world = crowded(4)
+    env = evaluation_environment(world, settings.algo, conditions, "evaluation", 0, 2, settings.network.memory)
+    tensordict, kept = env.reset(), []
+    policy = PursuitPolicy()
+    for _ in range(world.task.episode_steps):
+        tensordict = env.step(policy(tensordict))
+        kept.append(tensordict.clone())
+        tensordict = env.step_mdp(tensordict)
+    env.close()
+    steps = torch.stack(kept, 1)
+    weights = torch.tensor([0.5, 0.5, 2.0, 2.0])
+    assert torch.equal(steps["collision_weight"].squeeze(-1), weights.view(4, 1).expand(4, world.task.episode_steps))
+    parts = steps["next", "reward_components"]
+    rest = parts[..., 0] + parts[..., 1] + parts[..., 2] * parts[..., 3]
+    paid = (rest + weights.view(4, 1) * parts[..., 4]).sum(1)
+    torch.testing.assert_close(steps["next", "reward"].squeeze(-1).sum(1), paid, rtol=1e-5, atol=1e-4)
+    collisions = (parts[..., 4] / -10.0).sum(1)
+    assert collisions.sum() > 0, "the map is crowded enough to tell the two rewards apart"
+    reported = evaluation.episode_metrics(steps)["reward"]
+    torch.testing.assert_close(reported.float(), (rest + parts[..., 4]).sum(1), rtol=1e-5, atol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------ who meets what
+def crowded(num_agents: int) -> WorldSettings:
+    """A small world in which a blind controller hits something soon."""
+    cfg = ["map.num_movers=0", "map.clutter_per_m2=0.6", "map.mapped_fraction=0", "task.episode_steps=60"]
+    settings = tiny_settings("rcwr", *cfg)
+    return WorldSettings(settings.map, settings.task, "narrow", num_agents=num_agents, num_workers=0)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_agent_i_of_every_condition_meets_the_same_start(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rcdsac_trl.pipeline.build.world.make_env", partial(make_env, serial=True))
+    settings = tiny_settings("rcdsac_pow")
+    conditions = [Condition(beta=beta) for beta in (-2.0, -1.0, 0.0, -0.5)]
+    agents = 3
+    world = WorldSettings(settings.map, settings.task, "narrow", num_agents=12, num_workers=workers)
+    env = evaluation_environment(world, settings.algo, conditions, "evaluation", 0, agents, settings.network.memory)
+    starts = []
+    for _ in range(2):
+        first = env.reset().reshape(-1)
+        assert first["risk"].flatten().tolist() == [c.beta for c in conditions for _ in range(agents)]
+        blocks = first["pose"].view(len(conditions), agents, 3)
+        assert (blocks == blocks[:1]).all()
+        assert len({tuple(pose) for pose in blocks[0].tolist()}) == agents, "the agents of a block start apart"
+        for key in ("range", "waypoint"):
+            assert (
+                first[key].view(len(conditions), agents, -1) == first[key].view(len(conditions), agents, -1)[:1]
+            ).all()
+        starts.append(blocks[0])
+    assert not torch.equal(*starts), "the next map is another one"
+    env.close()
+
+
+def test_a_run_meets_the_same_episodes_as_the_baseline(run: Path) -> None:
+    settings = tiny_settings()
+    world = WorldSettings(settings.map, settings.task, "narrow", num_agents=2, num_workers=0)
+    poses = []
+    for algo, conditions in ((settings.algo, [Condition(beta=-1.0)]), (None, [Condition()])):
+        env = evaluation_environment(world, algo, conditions, "evaluation", 0, 2, settings.network.memory)
+        poses.append(env.reset()["pose"])
+        env.close()
+    assert torch.equal(*poses)
+
+
+def test_actions_are_tanh_of_the_mean(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[TensorDictBase] = []
+
+    def watched(env: EnvBase, policy: TensorDictModuleBase, steps: int) -> TensorDictBase:
+        def drive(tensordict: TensorDictBase) -> TensorDictBase:
+            out = policy(tensordict)
+            seen.append(out.select("loc", "scale", "action").clone())
+            return out
+
+        return run_episodes(env, drive, steps)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(evaluation, "run_episodes", watched)
+    evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'a'}")
+    steps = torch.stack(seen)
+    torch.testing.assert_close(steps["action"], steps["loc"].tanh(), rtol=0, atol=1e-6)
+    seen.clear()
+    evaluate(f"run={run}", "beta=[-1]", "sampled=true", f"out={tmp_path / 'b'}")
+    drawn = torch.stack(seen)
+    noise = (drawn["action"].clamp(-0.999, 0.999).atanh() - drawn["loc"]) / drawn["scale"]
+    assert noise.std().item() == pytest.approx(1.0, abs=0.3)
+
+
+def test_the_named_checkpoint_drives(run: Path, tmp_path: Path) -> None:
+    """Saved weights act: what is saved under a name is what an evaluation under that name measures."""
+    changed = tmp_path / "run"
+    shutil.copytree(run, changed)
+    settings = tiny_settings()
+    loss = make_loss(settings, "cpu")
+    load_weights(changed / "checkpoints", "best", loss)
+    checkpoints = Checkpoints(changed / "checkpoints", loss, make_optimizer(loss, settings.learner))
+    checkpoints.save("last", load_manifest(changed / "checkpoints", "best"))
+    given = [f"run={changed}", "beta=[-1]"]
+    best = contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"]
+    assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'same'}"))["episodes.csv"] == best
+    with torch.no_grad():
+        for value in loss.actor_network_params.values(True, True):
+            value.mul_(2.0)
+    checkpoints.save("last", {})
+    assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'other'}"))["episodes.csv"] != best
+    assert contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"] == best
+
+
+# ------------------------------------------------------------------------------------------------ pursuit, validation
+def test_the_pursuit_baseline_drives_without_any_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    small = ["map=easy", "task=default", "task.episode_steps=120"]
+    out = evaluate("baseline=pursuit", *small)
+    assert out == Path("evaluation") / "pursuit-narrow-evaluation-seed0-1x2"
+    episodes = pd.read_csv(out / "episodes.csv")
+    assert len(episodes) == 2
+    assert episodes[["beta", "collision_weight"]].isna().all(axis=None)
+    assert (episodes["mean_speed_m_per_s"] > 0.25).all(), "it drives"
+    described = json.loads((out / "evaluation.json").read_text())
+    assert (described["agent"], described["measure"], described["checkpoint"]) == ("pursuit", None, None)
+    assert contents(evaluate("baseline=pursuit", *small, "out=again")) == contents(out)
+
+
+def test_a_validation_repeats_itself_and_follows_the_agent(tmp_path: Path) -> None:
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "validation.num_maps=2")
+    first, again = trainer.validate(), trainer.validate()
+    pd.testing.assert_frame_equal(first, again)
+    with torch.no_grad():  # the weights are the learner's own, not a copy
+        for value in trainer.learner.loss.actor_network_params.values(True, True):
+            if isinstance(value, torch.nn.Parameter):
+                value.mul_(3.0)
+    assert not trainer.validate()["reward"].equals(first["reward"])
+    trainer.validate.close()
+    trainer.validate.close()  # once more does no harm
+    trainer.collector.shutdown()
+    trainer.log.close()
+
+
+def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    built: EvaluationRun = build.evaluation(compose("evaluate", [f"run={run}", "beta=[-1]", f"out={out}"]))
+    assert built.out == out
+    assert not out.exists()
+
+
+def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[bool] = []
+    # By its name, because the package exports a function of the module's name.
+    module = importlib.import_module("rcdsac_trl.pipeline.build.evaluation")
+    original: Callable[..., EnvBase] = module.evaluation_environment
+
+    def watched(*arguments: Any) -> EnvBase:
+        env = original(*arguments)
+        close = env.close
+        monkeypatch.setattr(env, "close", lambda **kwargs: (closed.append(True), close(**kwargs)))
+        return env
+
+    monkeypatch.setattr(module, "evaluation_environment", watched)
+    evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
+    assert closed == [True]
