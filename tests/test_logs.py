@@ -90,7 +90,7 @@ EXPECTED_SCALARS = {
     "validation/score",
     *(f"learn/loss_{name}" for name in ("qvalue", "actor", "alpha")),
     *(f"learn/{name}" for name in ("alpha", "entropy", "td_error", "q_value", "quantile_spread")),
-    "learn/range_fraction",
+    "learn/distortion_strength",
     "learn/updates",
     "time/elapsed_s",
     "time/steps_per_s",

@@ -194,11 +194,11 @@ def test_sampled_range_is_a_setting() -> None:
 
 
 def test_widen() -> None:
-    assert [CVaR().widen(0.2, f) for f in (0.0, 0.5, 1.0)] == pytest.approx([1.0, 0.6, 0.2])
-    torch.testing.assert_close(PowerLaw().widen(torch.tensor([-2.0, 0.0]), 0.25), torch.tensor([-0.5, 0.0]))
-    assert VaR().widen(0.3, 1.0) == 0.3
+    assert [CVaR().temper(0.2, f) for f in (0.0, 0.5, 1.0)] == pytest.approx([1.0, 0.6, 0.2])
+    torch.testing.assert_close(PowerLaw().temper(torch.tensor([-2.0, 0.0]), 0.25), torch.tensor([-0.5, 0.0]))
+    assert VaR().temper(0.3, 1.0) == 0.3
     with pytest.raises(UserInputError, match="'var' has no neutral beta"):
-        VaR().widen(0.3, 0.5)
+        VaR().temper(0.3, 0.5)
 
 
 @pytest.mark.parametrize(

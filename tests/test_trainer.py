@@ -70,11 +70,11 @@ class StubLearner(Learner):
         assert episodes.batch_size == torch.Size([2, 4])
         self.events.append("store")
 
-    def updates(self, number: int, range_fraction: float) -> dict[str, float]:
+    def updates(self, number: int, distortion_strength: float) -> dict[str, float]:
         if self.calls == self.interrupt_in:
             raise KeyboardInterrupt
         self.calls += 1
-        self.events.append(("update", number, range_fraction))
+        self.events.append(("update", number, distortion_strength))
         return {"loss_qvalue": 1.0}
 
 
@@ -116,7 +116,7 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
         "pursuit_iterations": 0,
         "pursuit_noise": 0.0,
         "neutral_iterations": 1,
-        "widening_iterations": 2,
+        "ramp_iterations": 2,
     }
     parts = {
         "scores": range(100),
@@ -245,9 +245,9 @@ def test_losses_are_averaged_over_the_updates() -> None:
             self.value = 0.0
             self.fractions: list[float] = []
 
-        def update(self, range_fraction: float) -> dict[str, torch.Tensor]:
+        def update(self, distortion_strength: float) -> dict[str, torch.Tensor]:
             self.value += 1.0
-            self.fractions.append(range_fraction)
+            self.fractions.append(distortion_strength)
             return {"a": torch.tensor(self.value), "b": torch.tensor(-self.value)}
 
     learner = Counting()

@@ -48,7 +48,7 @@ class Countdown(EnvBase):
 
 
 def widening(u: float, episode: int) -> float:
-    return PowerLaw().widen(PowerLaw().from_uniform(u), min(1.0, 0.25 * episode))
+    return PowerLaw().temper(PowerLaw().from_uniform(u), min(1.0, 0.25 * episode))
 
 
 def make_env(base: EnvBase | None = None, **settings: object) -> TransformedEnv:

@@ -178,6 +178,9 @@ class DistributionalSACLoss(LossModule):
         self.target_entropy = target_entropy
         self.burn_in = burn_in
         self.reduction = reduction
+        #: How much of beta counts in the actor's loss; the trainer lets it grow from 0 (as if neutral) to 1 (all).
+        #: The networks are told the whole beta from the start, so that no value of it is ever new to them.
+        self.distortion_strength = 1.0
         self._generator = generator or torch.Generator().manual_seed(0)
 
     # ------------------------------------------------------------------------------------------- TorchRL's idiom
@@ -327,7 +330,7 @@ class DistributionalSACLoss(LossModule):
         action, log_prob = self._act(actor_memory[:, :-1], risk)
         tau = self._fractions(self.num_risk_samples, log_prob)
         if tau is not None and risk is not None:
-            tau = self.measure.psi(tau, risk)
+            tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
         with self.critic_network_params.detach().to_module(self.critic_network, preserve_module_state=False):
             values = [
                 self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)

@@ -9,7 +9,7 @@ One sign convention holds for all of them: returns are rewards, and a *smaller* 
 Public names::
 
     RiskMeasure                        psi(tau, beta), weight(u, beta), embed(beta), sample(shape, generator),
-                                       from_uniform(u), widen(beta, fraction), check(beta)
+                                       from_uniform(u), temper(beta, strength), check(beta)
                                        .low, .high (sampled range)  .domain  .neutral_beta  .name
     Neutral, CVaR, PowerLaw, Wang, CPW, VaR
     MEASURES: dict[str, type[RiskMeasure]]     "neutral", "cvar", "pow", "wang", "cpw", "var"
@@ -116,21 +116,21 @@ class RiskMeasure(ABC):
         """Draw ``beta`` uniformly over [``low``, ``high``], float32 of ``shape`` on the generator's device."""
         return self.from_uniform(torch.rand(tuple(shape), generator=generator, device=generator.device))
 
-    def widen(self, beta: Scalar, fraction: float) -> Scalar:
-        """Move ``beta`` towards neutral: 0 gives the neutral value, 1 leaves ``beta`` as it is.
+    def temper(self, beta: Scalar, strength: float) -> Scalar:
+        """Move ``beta`` towards neutral: strength 0 gives the neutral value, 1 leaves ``beta`` as it is.
 
-        Training that starts neutral and widens the range keeps an averse agent from never seeing success.
+        Training that begins neutral and lets the distortion grow keeps an averse agent from never seeing success.
 
         Raises:
-            UserInputError: if ``fraction`` is below 1 and the measure has no neutral value.
+            UserInputError: if ``strength`` is below 1 and the measure has no neutral value.
         """
-        if fraction == 1.0:
+        if strength == 1.0:
             return beta
         if self.neutral_beta is None:
             raise UserInputError(
                 f"measure {self.name!r} has no neutral beta to start from: train it without a warm-up of beta"
             )
-        return self.neutral_beta + fraction * (beta - self.neutral_beta)
+        return self.neutral_beta + strength * (beta - self.neutral_beta)
 
     def check(self, beta: float) -> None:
         """Raise :class:`UserInputError` unless ``beta`` lies in the domain."""

@@ -3,7 +3,7 @@
 Public names::
 
     EpisodeSampler(key, draw, *, seed, agent_ids, first_episode=0, fixed=None)   Transform, outside ParallelEnv
-    Relabel(measure, *, mode, per="transition", beta=None, generator=None)       batch, fraction -> batch
+    Relabel(measure, *, mode, per="transition", beta=None, generator=None)       batch -> batch
 """
 
 from collections.abc import Callable, Sequence
@@ -98,7 +98,7 @@ class Relabel:
     """Sets the `risk` of a batch of sequences: the paper's *resample* and *stored*, or one beta for all.
 
     Args:
-        measure: draws and widens beta.
+        measure: draws beta.
         mode: ``"resample"`` draws a fresh beta; ``"stored"`` keeps the one in the batch; ``"fixed"`` sets `beta`.
         per: draw once for each ``"transition"`` or each ``"sequence"`` (resample only).
         beta: the value of ``"fixed"``.
@@ -131,12 +131,12 @@ class Relabel:
         self.beta = beta
         self.generator = generator
 
-    def __call__(self, batch: TensorDictBase, fraction: float = 1.0) -> TensorDictBase:
-        """Set `risk` ``[B, L + 1, 1]``; `fraction` of the measure's range is open around neutral."""
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Set `risk` ``[B, L + 1, 1]``."""
         sequences, slots = batch.shape
         if self.mode == "fixed" and self.beta is not None:
             return batch.set("risk", torch.full((sequences, slots, 1), self.beta, device=batch.device))
         if self.mode == "resample" and self.generator is not None:
             drawn = self.measure.sample((sequences, slots if self.per == "transition" else 1, 1), self.generator)
-            return batch.set("risk", self.measure.widen(drawn, fraction).expand(sequences, slots, 1))
+            return batch.set("risk", drawn.expand(sequences, slots, 1))
         return batch

@@ -99,8 +99,8 @@ class TrainingSettings:
         """Refuse what does not fit together, or not this machine."""
         _check_least("seed", self.seed, 0)
         runtime.resolve_threads(self.threads)
-        if self.schedule.range_fraction(0) < 1 and self.algo.conditioning == "per_episode":
-            self.algo.distortion.measure.widen(0.0, 0.0)  # refuses a measure without a neutral beta
+        if self.schedule.distortion_strength(0) < 1:
+            self.algo.distortion.measure.temper(0.0, 0.0)  # refuses a measure without a neutral beta
         if not self.algo.default_conditions:
             raise UserInputError(
                 "algo.distortion.evaluation_betas=[] leaves nothing to validate: give one beta or more"

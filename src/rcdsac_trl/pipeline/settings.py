@@ -251,17 +251,17 @@ class Schedule:
     pursuit_iterations: int
     pursuit_noise: float
     neutral_iterations: int
-    widening_iterations: int
+    ramp_iterations: int
 
     def __post_init__(self) -> None:
         """Refuse what cannot be scheduled."""
         _at_least("schedule", self, 1, "iterations")
         _at_least("schedule", self, 0, " ".join(f.name for f in fields(self)))
 
-    def range_fraction(self, iteration: int) -> float:
-        """Return how much of beta's range is open: 0 is neutral only, 1 the whole range."""
+    def distortion_strength(self, iteration: int) -> float:
+        """Return how much of beta counts in the actor's loss: 0 as if neutral, 1 all of it."""
         if iteration < self.neutral_iterations:
             return 0.0
-        if self.widening_iterations == 0:
+        if self.ramp_iterations == 0:
             return 1.0
-        return min(1.0, (iteration - self.neutral_iterations + 1) / self.widening_iterations)
+        return min(1.0, (iteration - self.neutral_iterations + 1) / self.ramp_iterations)

@@ -29,7 +29,7 @@ class Learner:
     Args:
         replay: gives batches of sequences.
         loss: returns ``loss_qvalue``, ``loss_actor``, ``loss_alpha`` with isolated gradients, and diagnostics.
-        relabel: sets the `risk` of a batch for a given fraction of beta's range; None: the loss reads none.
+        relabel: sets the `risk` of a batch; None: the loss reads none.
         optimizer: holds the parameters of all three losses.
         targets: moves the target critics.
         clipped: groups of parameters whose gradient norm is clipped together, and the limit; None: no clipping.
@@ -40,7 +40,7 @@ class Learner:
         *,
         replay: SequenceReplay,
         loss: LossModule,
-        relabel: Callable[[TensorDictBase, float], TensorDictBase] | None,
+        relabel: Callable[[TensorDictBase], TensorDictBase] | None,
         optimizer: torch.optim.Optimizer,
         targets: SoftUpdate,
         clipped: list[list[nn.Parameter]],
@@ -54,11 +54,11 @@ class Learner:
         self.clipped = clipped
         self.max_grad_norm = max_grad_norm
 
-    def update(self, range_fraction: float) -> dict[str, Tensor]:
+    def update(self) -> dict[str, Tensor]:
         """Do one update and return the losses and diagnostics, detached and still on the device."""
         batch: TensorDictBase = self.replay.sample()
         if self.relabel is not None:
-            batch = self.relabel(batch, range_fraction)
+            batch = self.relabel(batch)
         losses = self.loss(batch)
         # One backward pass serves all three: the loss isolates their gradients.
         torch.stack([losses[key] for key in LOSS_KEYS]).sum().backward()
@@ -70,11 +70,12 @@ class Learner:
         self.targets.step()
         return {key: value.detach() for key, value in losses.items()}
 
-    def updates(self, number: int, range_fraction: float) -> dict[str, float]:
-        """Do many updates and return the mean of everything :meth:`update` returns."""
+    def updates(self, number: int, distortion_strength: float) -> dict[str, float]:
+        """Do many updates at one distortion strength; return the mean of everything :meth:`update` returns."""
+        self.loss.distortion_strength = distortion_strength
         sums: dict[str, Tensor] = {}
         for _ in range(number):
-            for key, value in self.update(range_fraction).items():
+            for key, value in self.update().items():
                 sums[key] = sums[key] + value if key in sums else value.clone()
         return {key: (value / number).item() for key, value in sums.items()}
 
@@ -152,7 +153,7 @@ class Trainer:
 
     def _iterate(self, iteration: int, episodes: Iterator[TensorDictBase]) -> dict[str, float]:
         self.set_iteration(iteration)
-        fraction = self.schedule.range_fraction(iteration)
+        strength = self.schedule.distortion_strength(iteration)
         t0 = time.monotonic()
         batch = next(episodes)
         t1 = time.monotonic()
@@ -161,12 +162,12 @@ class Trainer:
         # Before the updates: episodes are logged under the number of updates that they were driven with.
         record = self._training_record(iteration, batch)
         t2 = time.monotonic()
-        diagnostics = self.learner.updates(self.schedule.updates_per_iteration, fraction)
+        diagnostics = self.learner.updates(self.schedule.updates_per_iteration, strength)
         self.updates += self.schedule.updates_per_iteration
         t3 = time.monotonic()
         record |= {f"learn/{key}": value for key, value in diagnostics.items()}
         record |= {
-            "learn/range_fraction": fraction,
+            "learn/distortion_strength": strength,
             "learn/updates": float(self.updates),
             "time/steps_per_s": batch.numel() / (t1 - t0),
             "time/updates_per_s": self.schedule.updates_per_iteration / max(t3 - t2, 1e-9),

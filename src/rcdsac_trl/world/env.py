@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -186,6 +187,16 @@ class _Workers(ParallelEnv):
         torch.set_num_threads(threads)
 
 
+def _worker_env(**kwargs: Any) -> NavigationEnv:
+    """Make the environment of a worker, which leaves Ctrl-C to the process that it works for.
+
+    A terminal sends Ctrl-C to all of them; workers that died of it could not be closed properly any more.
+    """
+    if multiprocessing.parent_process() is not None:  # the main process makes one too, to learn its specs
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return NavigationEnv(**kwargs)
+
+
 def _torch_spec(space: Space, batch: torch.Size) -> TensorSpec:
     shape = torch.Size([*batch, space.size])
     if space.dtype is np.bool_:
@@ -267,4 +278,4 @@ def make_env(
     if serial:
         return SerialEnv(workers, NavigationEnv, create_env_kwargs=kwargs)
     multiprocessing.set_forkserver_preload([__name__])
-    return _Workers(workers, NavigationEnv, create_env_kwargs=kwargs, mp_start_method=_START_METHOD)
+    return _Workers(workers, _worker_env, create_env_kwargs=kwargs, mp_start_method=_START_METHOD)

@@ -69,7 +69,6 @@ def trainer(cfg: DictConfig, folder: Path) -> Trainer:
         seed=settings.seed,
         agent_ids=range(world.num_agents),
         memory=settings.network.memory,
-        range_fraction=schedule.range_fraction,
     )
     exploration = torch.Generator(device=device)
     policy = CollectionPolicy(

@@ -1,6 +1,6 @@
 """Environments with everything a policy reads."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from torchrl.envs import EnvBase, InitTracker, StepCounter, TransformedEnv
 
@@ -21,7 +21,6 @@ def environment(
     agent_ids: Sequence[int],
     memory: int,
     conditions: Sequence[Condition] | None = None,
-    range_fraction: Callable[[int], float] = lambda episode: 1.0,
 ) -> EnvBase:
     """Make an environment with everything a policy reads.
 
@@ -33,7 +32,6 @@ def environment(
         agent_ids: numbers of the agents; equal numbers meet the same starts and goals.
         memory: size of the policy's recurrent state.
         conditions: tell agent i ``conditions[i]``; None draws what they are told an episode.
-        range_fraction: how much of beta's range is open in an episode.
     """
     weighted = algo is not None and algo.collision_weight is not None
     base = make_env(
@@ -52,7 +50,7 @@ def environment(
     env.append_transform(StepCounter(max_steps=world.task.episode_steps))
     env.append_transform(recurrent_state_primer(memory))
     if algo is not None and algo.context_key is not None:
-        env.append_transform(_told(algo, seed, agent_ids, conditions, range_fraction))
+        env.append_transform(_told(algo, seed, agent_ids, conditions))
     return env
 
 
@@ -61,7 +59,6 @@ def _told(
     seed: int,
     agent_ids: Sequence[int],
     conditions: Sequence[Condition] | None,
-    range_fraction: Callable[[int], float],
 ) -> EpisodeSampler:
     fixed: list[float] | None = None
     if algo.collision_weight is not None:
@@ -76,7 +73,7 @@ def _told(
         fixed = [c.beta for c in conditions if c.beta is not None]
     return EpisodeSampler(
         "risk",
-        lambda u, episode: measure.widen(measure.from_uniform(u), range_fraction(episode)),
+        lambda u, episode: measure.from_uniform(u),
         seed=seed,
         agent_ids=agent_ids,
         fixed=fixed,
