@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import tiny
 from rcdsac_trl import evaluate, train
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import build
@@ -282,6 +283,25 @@ def test_a_refusal_of_the_real_program(tmp_path: Path) -> None:
     assert (process.returncode, out) == (2, "")
     assert err == "rcdsac_trl: learner.batch_size=abc must be a whole number\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else(
+    tiny_run: Path, tmp_path: Path
+) -> None:
+    given = [f"run={tiny_run}", "beta=[-2,-1]"]
+    here = tiny.evaluate(*given, f"out={tmp_path / 'here'}")
+    cwd = tmp_path / "cwd"
+    cwd.mkdir()
+    sizes = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1"]
+    process = start(cwd, "rcdsac_trl.evaluate", *given, *sizes, "out=there")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    assert "collisions_mean" in out
+    assert out.endswith("written to there\n")
+    assert [path.name for path in cwd.iterdir()] == ["there"]
+    for name in ("episodes.csv", "summary.csv", "evaluation.json"):
+        assert (cwd / "there" / name).read_bytes() == (here / name).read_bytes()
 
 
 def interrupt(folder: Path, *arguments: str) -> tuple[int, str]:

@@ -135,7 +135,7 @@ def test_every_choice_of_a_group_is_readable(group: str) -> None:
 
 # ------------------------------------------------------------------------------------------------ schedule
 @pytest.mark.parametrize(
-    ("neutral", "widening", "fractions"),
+    ("neutral", "ramp", "strengths"),
     [
         (0, 0, [1, 1, 1, 1]),
         (2, 0, [0, 0, 1, 1]),
@@ -144,16 +144,16 @@ def test_every_choice_of_a_group_is_readable(group: str) -> None:
         (1, 1, [0, 1, 1]),
     ],
 )
-def test_distortion_strength_by_hand(neutral: int, widening: int, fractions: list[float]) -> None:
+def test_distortion_strength_by_hand(neutral: int, ramp: int, strengths: list[float]) -> None:
     schedule = Schedule(
         iterations=10,
         updates_per_iteration=0,
         pursuit_iterations=0,
         pursuit_noise=0.0,
         neutral_iterations=neutral,
-        ramp_iterations=widening,
+        ramp_iterations=ramp,
     )
-    assert [schedule.distortion_strength(i) for i in range(len(fractions))] == pytest.approx(fractions)
+    assert [schedule.distortion_strength(i) for i in range(len(strengths))] == pytest.approx(strengths)
 
 
 # ------------------------------------------------------------------------------------------------ types
@@ -287,7 +287,14 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     # Together these rows, and a world with one of everything, use every part there is.
     world = ["map.clutter_per_m2=0.05", "map.mapped_fraction=0.5", "map.layouts=[mixed]", "map.num_movers=1"]
     for row in ("rcdsac_pow", "dsac_cvar", "rcwr"):
-        tiny_trainer(tmp_path / row, row, *world, "schedule.iterations=1", "learner.max_grad_norm=1.0").run()
+        tiny_trainer(
+            tmp_path / row,
+            row,
+            *world,
+            "schedule.iterations=1",
+            "schedule.neutral_iterations=0",
+            "learner.max_grad_norm=1.0",
+        ).run()
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
     evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5")

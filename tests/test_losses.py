@@ -17,7 +17,7 @@ from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
 from rcdsac_trl.agent.functional import quantile_huber_loss, squash
 from rcdsac_trl.agent.losses import DistributionalSACLoss
 from rcdsac_trl.agent.networks import Widths
-from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw
+from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
 
 SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -383,6 +383,24 @@ def test_dsac_is_told_beta_by_the_measure_alone() -> None:
     neutral = loss(make_batch_like(batch, 0.0))
     torch.testing.assert_close(averse["loss_qvalue"], neutral["loss_qvalue"])
     assert not torch.allclose(averse["loss_actor"], neutral["loss_actor"])
+
+
+def test_distortion_strength_tempers_beta_in_the_distortion_alone() -> None:
+    """At strength 0 the actor's loss is that of the mean, though the networks are still told every beta."""
+    loss, batch = make_loss(), make_batch()
+    state = loss.rng_state
+
+    def losses(strength: float, measure: RiskMeasure, batch: TensorDict) -> TensorDictBase:
+        loss.rng_state, loss.distortion_strength, loss.measure = state, strength, measure
+        return loss(batch)
+
+    neutral = losses(0.0, PowerLaw(), batch)
+    full = losses(1.0, PowerLaw(), batch)
+    torch.testing.assert_close(neutral["loss_actor"], losses(1.0, Neutral(), batch)["loss_actor"])
+    assert (neutral["loss_actor"] - full["loss_actor"]).abs() > 1e-4
+    assert torch.equal(neutral["loss_qvalue"], full["loss_qvalue"])
+    told_nothing = losses(0.0, PowerLaw(), make_batch_like(batch, 0.0))
+    assert (neutral["loss_actor"] - told_nothing["loss_actor"]).abs() > 1e-4
 
 
 def make_batch_like(batch: TensorDict, beta: float) -> TensorDict:

@@ -193,7 +193,7 @@ def test_sampled_range_is_a_setting() -> None:
     assert measure.embed(-1.0) == 0.5  # does not move with the range
 
 
-def test_widen() -> None:
+def test_temper() -> None:
     assert [CVaR().temper(0.2, f) for f in (0.0, 0.5, 1.0)] == pytest.approx([1.0, 0.6, 0.2])
     torch.testing.assert_close(PowerLaw().temper(torch.tensor([-2.0, 0.0]), 0.25), torch.tensor([-0.5, 0.0]))
     assert VaR().temper(0.3, 1.0) == 0.3

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -165,13 +166,13 @@ def test_steps_and_updates_are_counted(tmp_path: Path) -> None:
     ]
 
 
-def test_each_iteration_is_told_before_its_episodes_and_its_updates_get_the_open_range(tmp_path: Path) -> None:
+def test_each_iteration_is_told_before_its_episodes_and_its_updates_get_its_strength(tmp_path: Path) -> None:
     events: list[Any] = []
     stub_trainer(tmp_path, events).run()
     assert [event[1] for event in kinds(events, "iteration")] == [0, 1, 2, 3, 4]
     told = [event for event in events if event[0] in ("iteration", "collect")]
     assert told == [(kind, iteration) for iteration in range(5) for kind in ("iteration", "collect")]
-    # one neutral iteration, then two that widen
+    # one neutral iteration, then a ramp of two
     assert [event[1:] for event in kinds(events, "update")] == [(3, 0.0), (3, 0.5), (3, 1.0), (3, 1.0), (3, 1.0)]
 
 
@@ -243,16 +244,17 @@ def test_losses_are_averaged_over_the_updates() -> None:
     class Counting(Learner):
         def __init__(self) -> None:
             self.value = 0.0
-            self.fractions: list[float] = []
+            self.strengths: list[float] = []
+            self.loss = SimpleNamespace(distortion_strength=None)
 
-        def update(self, distortion_strength: float) -> dict[str, torch.Tensor]:
+        def update(self) -> dict[str, torch.Tensor]:
             self.value += 1.0
-            self.fractions.append(distortion_strength)
+            self.strengths.append(self.loss.distortion_strength)
             return {"a": torch.tensor(self.value), "b": torch.tensor(-self.value)}
 
     learner = Counting()
     assert learner.updates(4, 0.5) == {"a": 2.5, "b": -2.5}
-    assert learner.fractions == [0.5] * 4
+    assert learner.strengths == [0.5] * 4
     assert learner.updates(0, 0.5) == {}
 
 
@@ -303,7 +305,7 @@ def test_an_update_moves_each_network_by_its_own_rule(trained: tuple[str, Path, 
     row, _, trainer = trained
     learner = trainer.learner
     before = networks(learner.loss)
-    losses = learner.update(1.0)
+    losses = learner.update()
     after = networks(learner.loss)
     assert set(LOSS_KEYS) <= set(losses)
     assert all(value.isfinite().all() and not value.requires_grad for value in losses.values())
@@ -347,20 +349,33 @@ def test_a_run_logs_what_its_row_tells(trained: tuple[str, Path, Trainer]) -> No
     assert sorted(map(tuple, seen.to_numpy().tolist()), key=str) == sorted(asked, key=str)
 
 
-def test_collected_betas_and_weights_lie_in_the_open_range(trained: tuple[str, Path, Trainer]) -> None:
+def test_every_episode_is_told_a_number_of_its_own(trained: tuple[str, Path, Trainer]) -> None:
     row, folder, _ = trained
     algo = tiny_settings(row).algo
     training = pd.read_csv(folder / "training_episodes.csv")
-    first, second = (training[training["iteration"] == i] for i in (0, 1))
-    if algo.context_key == "risk":  # the smoke schedule: one neutral iteration, then the whole range
-        measure = algo.distortion.measure
-        assert (first["beta"] == measure.neutral_beta).all()
-        assert second["beta"].between(measure.low, measure.high).all()
-        assert second["beta"].nunique() == AGENTS
+    if algo.context_key == "risk":  # the whole range from the first iteration, also while its distortion is ramped up
+        low, high, told = algo.distortion.low, algo.distortion.high, training["beta"]
     elif algo.collision_weight is not None:
-        weights = training["collision_weight"]
-        assert weights.between(*algo.collision_weight).all()
-        assert weights.nunique() == AGENTS * ITERATIONS
+        (low, high), told = algo.collision_weight, training["collision_weight"]
+    else:
+        return
+    assert told.between(low, high).all()
+    assert told.nunique() == AGENTS * ITERATIONS
+
+
+def test_the_distortion_is_ramped_up_to_all_of_it(trained: tuple[str, Path, Trainer]) -> None:
+    _, _, trainer = trained
+    # The smoke schedule: one neutral iteration, then a ramp of one.
+    assert [trainer.schedule.distortion_strength(iteration) for iteration in range(ITERATIONS)] == [0.0, 1.0]
+    assert trainer.learner.loss.distortion_strength == 1.0
+
+
+def test_one_agent_alone_trains_too(tmp_path: Path) -> None:
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "world.num_agents=1", "schedule.iterations=1")
+    records: list[dict[str, float]] = []
+    trainer.log.scalars = lambda values, step: records.append(dict(values))  # type: ignore[method-assign, assignment]
+    trainer.run()
+    assert all(math.isfinite(value) for value in records[0].values())
 
 
 @pytest.mark.parametrize("row", ["rcdsac_pow", "rcwr"])

@@ -190,7 +190,8 @@ class Trainer:
             in_order = rows.sort_values(told)
             halves = {"low": in_order[: len(rows) // 2], "high": in_order[len(rows) // 2 :]}
             for half, part in halves.items():
-                record |= {f"train/{metric}/{half}_{told}": float(part[metric].mean()) for metric in METRICS}
+                if len(part):  # a single agent has no lower half
+                    record |= {f"train/{metric}/{half}_{told}": float(part[metric].mean()) for metric in METRICS}
         rows.insert(0, "episode", range(len(rows)))
         rows.insert(0, "iteration", iteration)
         rows.insert(1, "updates", self.updates)
