@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.pipeline.typed import read
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.maps import SPLITS, Map, MapSettings, Split, generate_map
@@ -133,7 +134,7 @@ def _legend() -> list[Patch | Line2D]:
 def _read(cfg: DictConfig) -> tuple[Sheet, MapSettings]:
     values = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
     map_values = values.pop("map")
-    return Sheet(**values), MapSettings(**map_values)
+    return read(Sheet, values), read(MapSettings, map_values, "map")
 
 
 def check(cfg: DictConfig) -> None:

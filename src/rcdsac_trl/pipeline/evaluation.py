@@ -134,6 +134,13 @@ class Validation:
             self.env.close(raise_if_closed=False)
 
 
+def _without_commit(described: str) -> dict[str, Any]:
+    """Return what was evaluated; the same by a later commit may take its place."""
+    values: dict[str, Any] = json.loads(described)
+    values.pop("commit", None)
+    return values
+
+
 class EvaluationRun:
     """An evaluation and the folder it writes: ``episodes.csv``, ``summary.csv`` and ``evaluation.json``.
 
@@ -162,7 +169,7 @@ class EvaluationRun:
         if out.exists() and not out.is_dir():
             raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
         path = out / "evaluation.json"
-        if path.exists() and path.read_text() != self.described:
+        if path.exists() and _without_commit(path.read_text()) != _without_commit(self.described):
             raise UserInputError(f"{out} holds an evaluation of something else: give another folder with out=<folder>")
 
     def run(self) -> None:
