@@ -98,7 +98,7 @@ def test_it_refuses_to_overwrite_another_evaluation(run: Path, tmp_path: Path) -
 
 def test_results_go_beside_the_run_unless_told_otherwise(run: Path) -> None:
     out = evaluate(f"run={run}", "beta=[-1]", "seed=5", "checkpoint=last")
-    assert out == run / "evaluation" / "last-evaluation-seed5-1x2"
+    assert out == run / "evaluation" / "last-evaluation-seed5-1x2-beta_-1"
     assert contents(out)
 
 

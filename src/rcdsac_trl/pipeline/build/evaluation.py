@@ -39,9 +39,8 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     if settings.run is not None:
         checkpoints = Path(settings.run) / "checkpoints"
         load_manifest(checkpoints, settings.checkpoint)
-        told = [c.beta if c.beta is not None else c.collision_weight for c in conditions]
-        values = "_".join(f"{value:g}" for value in told if value is not None)
-        default_out = Path(settings.run) / "evaluation" / "-".join(filter(None, (settings.checkpoint, name, values)))
+        told = "".join(f"-{condition}".replace("=", "_") for condition in conditions)
+        default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{told}"
     else:
         default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
 
