@@ -161,7 +161,7 @@ def test_counts_follow_the_settings() -> None:
 
 def test_clutter_density() -> None:
     for layout, expected in (("rooms", 60), ("clutter", 90)):
-        map_ = generate_map(MapSettings(layouts=(layout,)), "train", 0, 0)
+        map_ = generate_map(MapSettings(layouts=(layout,), clutter_per_m2=0.15), "train", 0, 0)
         clutter = sum(not box.wall for box in map_.boxes) + len(map_.cylinders)
         assert 0.8 * expected <= clutter <= expected
 
@@ -345,8 +345,8 @@ def test_draw_maps_writes_the_picture_and_nothing_else(tmp_path: Path) -> None:
     ("override", "sentence"),
     [
         ("count=0", "count=0 is not a whole number from 1 to 100"),
-        ("count=many", "count=many is not a whole number"),
-        ("split=training", "choose one of train, validation, evaluation"),
+        ("count=many", "count=many must be a whole number"),
+        ("split=training", "must be one of train, validation, evaluation"),
         ("seed=-1", "seed=-1 is not"),
         ("out=maps.jpg", "does not name a PNG file"),
         ("map.num_movers=-3", "num_movers is -3"),
