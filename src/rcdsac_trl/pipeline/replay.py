@@ -16,15 +16,14 @@ from torchrl.data.replay_buffers.storages import Storage
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import torch_stream
+from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES
+from rcdsac_trl.world.task import total_reward
 
 # What o_rng can be where it is not 0: 2.5 + log10(d) for d in (0.01, 3) m.
 RANGE_LOW = 0.5
 RANGE_HIGH = 2.978
 _LEVELS = 65534
 _OFFSET = 32768
-WAYPOINT_FEATURES = 6
-VELOCITY_FEATURES = 4
-ACTION_FEATURES = 2
 
 
 class RangeCodec:
@@ -106,9 +105,9 @@ def slot_spec(num_bins_kept: int, context_keys: tuple[str, ...]) -> dict[str, tu
     """Return the features and type of every key of a slot; the memory of the replay follows from it."""
     spec = {
         "range": (num_bins_kept, torch.int16),
-        "waypoint": (WAYPOINT_FEATURES, torch.float32),
-        "velocity": (VELOCITY_FEATURES, torch.float32),
-        "action": (ACTION_FEATURES, torch.float32),
+        "waypoint": (SPACES["waypoint"].size, torch.float32),
+        "velocity": (SPACES["velocity"].size, torch.float32),
+        "action": (ACTION_SIZE, torch.float32),
         "reward_rest": (1, torch.float32),
         "reward_collision": (1, torch.float32),
     }
@@ -184,7 +183,7 @@ class SequenceReplay:
         final = episodes[:, -1]
         components = episodes["next", "reward_components"]
         collision = components[..., 4:5]
-        rest = components[..., 0:1] + components[..., 1:2] + components[..., 2:3] * components[..., 3:4]
+        rest = torch.from_numpy(total_reward(components.numpy(), collision_weight=0.0)).unsqueeze(-1)
         slots = {
             key: torch.cat([episodes[key], final["next", key].unsqueeze(1)], 1)
             for key in ("range", "waypoint", "velocity")

@@ -12,6 +12,7 @@ from rcdsac_trl.pipeline.policies import OnDevice
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import LearnerSettings
 from rcdsac_trl.seeding import torch_seed, torch_stream
+from rcdsac_trl.world.spaces import ACTION_SIZE
 
 
 def make_loss(settings: TrainingSettings, device: str) -> LossModule:
@@ -23,9 +24,10 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
     # Layers draw their first weights from torch's global generator: lend it our stream, and give it back.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(torch_seed(settings.seed, "weights"))
-        actor = build_actor(2, vectors, algo.network_measure, widths)
+        actor = build_actor(ACTION_SIZE, vectors, algo.network_measure, widths)
         critics = [
-            build_critic(2, vectors, algo.critic, algo.network_measure, widths) for _ in range(learner.num_critics)
+            build_critic(ACTION_SIZE, vectors, algo.critic, algo.network_measure, widths)
+            for _ in range(learner.num_critics)
         ]
     loss = DistributionalSACLoss(
         actor.to(device),
