@@ -8,7 +8,7 @@ import torch
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline.build.agent import make_loss, make_optimizer
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_optimizer
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_manifest, load_weights
 from tiny import tiny_settings
 
@@ -17,6 +17,11 @@ PROGRESS = {"iteration": 3, "steps": 120, "updates": 8, "best_score": -1.25}
 
 def make(seed: int, row: str = "rcdsac_pow") -> LossModule:
     return make_loss(tiny_settings(row, f"seed={seed}"), "cpu")
+
+
+def checkpoints_of(folder: Path, loss: LossModule) -> Checkpoints:
+    learner = tiny_settings().learner
+    return Checkpoints(folder, loss, make_average(loss, learner), make_optimizer(loss, learner))
 
 
 def weights(loss: LossModule) -> dict[str, torch.Tensor]:
@@ -35,7 +40,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LossModule]:
     folder = tmp_path_factory.mktemp("checkpoints")
     loss = make(seed=0)
     torch.rand(5, generator=loss._generator)  # the generator has moved on, and that is saved too
-    Checkpoints(folder, loss, make_optimizer(loss, tiny_settings().learner)).save("last", PROGRESS)
+    checkpoints_of(folder, loss).save("last", PROGRESS)
     return folder, loss
 
 
@@ -47,29 +52,44 @@ def test_round_trip_restores_every_weight(tmp_path: Path, row: str) -> None:
         loss.log_alpha.fill_(-0.75)
         for target in loss.target_critic_network_params.values(True, True):
             target.mul_(0.5)
-    Checkpoints(tmp_path, loss, make_optimizer(loss, tiny_settings(row).learner)).save("best", PROGRESS)
+    checkpoints_of(tmp_path, loss).save("best", PROGRESS)
     assert not same(loss, other)
-    assert load_weights(tmp_path, "best", other) == PROGRESS
+    assert load_weights(tmp_path, "best", loss=other) == PROGRESS
     assert same(loss, other)
     assert other.log_alpha.item() == -0.75
+
+
+def test_loss_and_average_come_back_each_by_itself(tmp_path: Path) -> None:
+    learner = tiny_settings().learner
+    loss, other = make(seed=0), make(seed=1)
+    average, again = make_average(loss, learner), make_average(other, learner)
+    with torch.no_grad():
+        for parameter in average.parameters():
+            parameter.mul_(0.5)
+    Checkpoints(tmp_path, loss, average, make_optimizer(loss, learner)).save("last", PROGRESS)
+    untouched = weights(other)
+    assert load_weights(tmp_path, "last", average=again) == PROGRESS
+    pairs = zip(average.module.parameters(), again.module.parameters(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+    assert all(torch.equal(value, untouched[key]) for key, value in weights(other).items())
 
 
 def test_the_state_of_the_generator_comes_back(saved: tuple[Path, LossModule]) -> None:
     folder, loss = saved
     other = make(seed=1)
-    load_weights(folder, "last", other)
+    load_weights(folder, "last", loss=other)
     assert torch.equal(torch.rand(3, generator=other._generator), torch.rand(3, generator=loss._generator))
 
 
 def test_saving_again_replaces(tmp_path: Path) -> None:
     loss = make(seed=0)
-    checkpoints = Checkpoints(tmp_path, loss, make_optimizer(loss, tiny_settings().learner))
+    checkpoints = checkpoints_of(tmp_path, loss)
     checkpoints.save("last", PROGRESS)
     with torch.no_grad():
         loss.log_alpha.fill_(1.5)
     checkpoints.save("last", PROGRESS | {"updates": 9})
     other = make(seed=1)
-    assert load_weights(tmp_path, "last", other)["updates"] == 9
+    assert load_weights(tmp_path, "last", loss=other)["updates"] == 9
     assert other.log_alpha.item() == 1.5
     assert [path.name for path in tmp_path.iterdir()] == ["last"], "nothing is left beside it"
 
@@ -90,12 +110,12 @@ def test_nothing_is_pickled(saved: tuple[Path, LossModule], monkeypatch: pytest.
         monkeypatch.setattr(pickle, name, refuse)
     monkeypatch.setattr(torch, "load", refuse)
     other = make(seed=1)
-    load_weights(folder, "last", other)
+    load_weights(folder, "last", loss=other)
     assert same(other, loss)
 
 
 def test_a_missing_checkpoint_is_one_sentence(tmp_path: Path) -> None:
-    for call in (lambda: load_manifest(tmp_path, "best"), lambda: load_weights(tmp_path, "best", make(0))):
+    for call in (lambda: load_manifest(tmp_path, "best"), lambda: load_weights(tmp_path, "best", loss=make(0))):
         with pytest.raises(UserInputError) as caught:
             call()
         assert str(caught.value) == f"there is no checkpoint {tmp_path / 'best'}: has this run saved one yet?"
@@ -108,5 +128,5 @@ def test_a_training_leaves_best_and_last_with_their_progress(tiny_run: Path) -> 
     assert load_manifest(tiny_run / "checkpoints", "last")["updates"] == 4
     assert load_manifest(tiny_run / "checkpoints", "last")["steps"] == 80
     trained = make_loss(tiny_settings(), "cpu")
-    load_weights(tiny_run / "checkpoints", "last", trained)
+    load_weights(tiny_run / "checkpoints", "last", loss=trained)
     assert not same(trained, make_loss(tiny_settings(), "cpu")), "training changed the weights that were saved"

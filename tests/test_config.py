@@ -105,6 +105,8 @@ def test_preset_paper_is_the_papers_table_of_hyper_parameters() -> None:
     # 5 M steps, all of which the replay holds, and 100,000 updates
     assert settings.replay_steps == 500 * 10 * 1000
     assert all(schedule.distortion_strength(iteration) == 1.0 for iteration in range(500))
+    assert all(schedule.learning_rate_share(iteration) == 1.0 for iteration in range(500))
+    assert learner.actor_average_decay == 0.0
 
 
 @pytest.mark.parametrize("preset", choices("preset"))
@@ -152,8 +154,28 @@ def test_distortion_strength_by_hand(neutral: int, ramp: int, strengths: list[fl
         pursuit_noise=0.0,
         neutral_iterations=neutral,
         ramp_iterations=ramp,
+        decay_iterations=0,
+        final_learning_rate_share=0.1,
     )
     assert [schedule.distortion_strength(i) for i in range(len(strengths))] == pytest.approx(strengths)
+
+
+@pytest.mark.parametrize(
+    ("iterations", "decay", "shares"),
+    [(3, 0, [1, 1, 1]), (4, 2, [1, 1, 0.6, 0.2]), (4, 4, [0.8, 0.6, 0.4, 0.2]), (2, 4, [0.4, 0.2]), (2, 1, [1, 0.2])],
+)
+def test_learning_rate_share_by_hand(iterations: int, decay: int, shares: list[float]) -> None:
+    schedule = Schedule(
+        iterations=iterations,
+        updates_per_iteration=0,
+        pursuit_iterations=0,
+        pursuit_noise=0.0,
+        neutral_iterations=0,
+        ramp_iterations=0,
+        decay_iterations=decay,
+        final_learning_rate_share=0.2,
+    )
+    assert [schedule.learning_rate_share(i) for i in range(iterations)] == pytest.approx(shares)
 
 
 # ------------------------------------------------------------------------------------------------ types

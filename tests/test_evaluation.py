@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import build, evaluation
-from rcdsac_trl.pipeline.build.agent import make_loss, make_optimizer
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_optimizer
 from rcdsac_trl.pipeline.build.world import evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_manifest, load_weights
 from rcdsac_trl.pipeline.cli import compose
@@ -333,14 +333,15 @@ def test_the_named_checkpoint_drives(run: Path, tmp_path: Path) -> None:
     shutil.copytree(run, changed)
     settings = tiny_settings()
     loss = make_loss(settings, "cpu")
-    load_weights(changed / "checkpoints", "best", loss)
-    checkpoints = Checkpoints(changed / "checkpoints", loss, make_optimizer(loss, settings.learner))
+    average = make_average(loss, settings.learner)
+    load_weights(changed / "checkpoints", "best", loss=loss, average=average)
+    checkpoints = Checkpoints(changed / "checkpoints", loss, average, make_optimizer(loss, settings.learner))
     checkpoints.save("last", load_manifest(changed / "checkpoints", "best"))
     given = [f"run={changed}", "beta=[-1]"]
     best = contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"]
     assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'same'}"))["episodes.csv"] == best
     with torch.no_grad():
-        for value in loss.actor_network_params.values(True, True):
+        for value in average.module.parameters():
             value.mul_(2.0)
     checkpoints.save("last", {})
     assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'other'}"))["episodes.csv"] != best

@@ -71,11 +71,11 @@ class StubLearner(Learner):
         assert episodes.batch_size == torch.Size([2, 4])
         self.events.append("store")
 
-    def updates(self, number: int, distortion_strength: float) -> dict[str, float]:
+    def updates(self, number: int, distortion_strength: float, learning_rate_share: float) -> dict[str, float]:
         if self.calls == self.interrupt_in:
             raise KeyboardInterrupt
         self.calls += 1
-        self.events.append(("update", number, distortion_strength))
+        self.events.append(("update", number, distortion_strength, learning_rate_share))
         return {"loss_qvalue": 1.0}
 
 
@@ -85,6 +85,7 @@ class StubValidation:
     def __init__(self, events: list[Any], scores: Sequence[float]) -> None:
         self.events = events
         self.scores = iter(scores)
+        self.steps = 4
 
     def __call__(self) -> pd.DataFrame:
         score = next(self.scores)
@@ -118,6 +119,8 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
         "pursuit_noise": 0.0,
         "neutral_iterations": 1,
         "ramp_iterations": 2,
+        "decay_iterations": 2,
+        "final_learning_rate_share": 0.5,
     }
     parts = {
         "scores": range(100),
@@ -172,8 +175,10 @@ def test_each_iteration_is_told_before_its_episodes_and_its_updates_get_its_stre
     assert [event[1] for event in kinds(events, "iteration")] == [0, 1, 2, 3, 4]
     told = [event for event in events if event[0] in ("iteration", "collect")]
     assert told == [(kind, iteration) for iteration in range(5) for kind in ("iteration", "collect")]
-    # one neutral iteration, then a ramp of two
-    assert [event[1:] for event in kinds(events, "update")] == [(3, 0.0), (3, 0.5), (3, 1.0), (3, 1.0), (3, 1.0)]
+    # one neutral iteration, then a ramp of two; the learning rates fall in the last two
+    assert [event[1] for event in kinds(events, "update")] == [3] * 5
+    assert [event[2] for event in kinds(events, "update")] == [0.0, 0.5, 1.0, 1.0, 1.0]
+    assert [event[3] for event in kinds(events, "update")] == [1.0, 1.0, 1.0, 0.75, 0.5]
 
 
 @pytest.mark.parametrize(("every", "validated"), [(1, 5), (2, 3), (5, 1), (50, 1)])
@@ -246,6 +251,8 @@ def test_losses_are_averaged_over_the_updates() -> None:
             self.value = 0.0
             self.strengths: list[float] = []
             self.loss = SimpleNamespace(distortion_strength=None)
+            self.optimizer = SimpleNamespace(param_groups=[{"lr": 1.0}, {"lr": 3.0}])  # type: ignore[assignment]
+            self._learning_rates = [2.0, 4.0]
 
         def update(self) -> dict[str, torch.Tensor]:
             self.value += 1.0
@@ -253,9 +260,12 @@ def test_losses_are_averaged_over_the_updates() -> None:
             return {"a": torch.tensor(self.value), "b": torch.tensor(-self.value)}
 
     learner = Counting()
-    assert learner.updates(4, 0.5) == {"a": 2.5, "b": -2.5}
+    assert learner.updates(4, 0.5, 0.25) == {"a": 2.5, "b": -2.5}
     assert learner.strengths == [0.5] * 4
-    assert learner.updates(0, 0.5) == {}
+    # Shares are of the rates at the start, not of those of the updates before.
+    assert [group["lr"] for group in learner.optimizer.param_groups] == [0.5, 1.0]
+    assert learner.updates(0, 0.5, 1.0) == {}
+    assert [group["lr"] for group in learner.optimizer.param_groups] == [2.0, 4.0]
 
 
 # ------------------------------------------------------------------------------------------------ every row, for real
@@ -322,6 +332,23 @@ def test_an_update_moves_each_network_by_its_own_rule(trained: tuple[str, Path, 
         else:  # Adam's steps are of the learning rate's size, and no larger for long
             step = (after[name] - before[name]).abs().max().item()
             assert 0 < step < 3 * rates[part], name
+
+
+def test_the_average_follows_the_actor_by_its_decay(tmp_path: Path) -> None:
+    trainer = tiny_trainer(tmp_path, "rcdsac_pow", "learner.actor_average_decay=0.75")
+    trainer.run()
+    learner = trainer.learner
+    before = [p.detach().clone() for p in learner.average.module.parameters()]
+    learner.update()
+    online = list(learner.loss.actor_network.parameters())
+    for old, new, actor in zip(before, learner.average.module.parameters(), online, strict=True):
+        torch.testing.assert_close(new, 0.75 * old + 0.25 * actor, rtol=0, atol=1e-6)
+
+
+def test_without_decay_the_average_is_the_actor(trained: tuple[str, Path, Trainer]) -> None:
+    learner = trained[2].learner
+    pairs = zip(learner.average.module.parameters(), learner.loss.actor_network.parameters(), strict=True)
+    assert all(torch.equal(average, actor) for average, actor in pairs)
 
 
 def test_a_run_evaluates(trained: tuple[str, Path, Trainer]) -> None:
@@ -402,7 +429,7 @@ def test_gradients_are_clipped_per_network(tmp_path: Path, row: str) -> None:
 # ------------------------------------------------------------------------------------------------ repeatability
 def saved_weights(run: Path, *overrides: str) -> dict[str, torch.Tensor]:
     loss = fresh_loss("rcdsac_pow", *overrides)
-    load_weights(run / "checkpoints", "last", loss)
+    load_weights(run / "checkpoints", "last", loss=loss)
     return networks(loss)
 
 
@@ -522,6 +549,7 @@ def test_progress_is_saved_with_the_weights(tiny_run: Path) -> None:
     assert progress["steps"] == ITERATIONS * AGENTS * STEPS
     assert progress["updates"] == ITERATIONS * UPDATES
     validation = pd.read_csv(tiny_run / "validation_episodes.csv")
-    scores = validation.groupby("iteration")["reward"].mean()
+    validation["score"] = validation["reward"] - STEPS * validation["contact_fraction"]
+    scores = validation.groupby("iteration")["score"].mean()
     assert progress["best_score"] == pytest.approx(scores.max(), rel=1e-4)
     assert load_manifest(tiny_run / "checkpoints", "best")["iteration"] == scores.idxmax()

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import Checkpoint
 from torchrl.objectives import LossModule
 
@@ -12,17 +13,22 @@ from rcdsac_trl.errors import UserInputError
 
 
 class Checkpoints:
-    """Saves a loss (all weights, targets and temperature) and its optimiser with :mod:`torchrl.checkpoint`.
+    """Saves a loss (all weights, targets and temperature), the averaged actor and the optimiser.
+
+    Built on :mod:`torchrl.checkpoint`.
 
     Args:
         folder: where ``last`` and ``best`` go.
-        loss: the loss module; holds every weight.
+        loss: the loss module; holds every weight that is learnt.
+        average: the running average of its actor.
         optimizer: its optimiser.
     """
 
-    def __init__(self, folder: Path, loss: LossModule, optimizer: torch.optim.Optimizer) -> None:
+    def __init__(
+        self, folder: Path, loss: LossModule, average: AveragedModel, optimizer: torch.optim.Optimizer
+    ) -> None:
         self.folder = folder
-        self._checkpoint = Checkpoint(loss=loss, optimizer=optimizer)
+        self._checkpoint = Checkpoint(loss=loss, average=average, optimizer=optimizer)
 
     def save(self, name: str, progress: Mapping[str, Any]) -> Path:
         """Write a checkpoint; `progress` is kept in its manifest."""
@@ -41,8 +47,10 @@ def load_manifest(folder: Path, name: str) -> dict[str, Any]:
     return dict(Checkpoint.manifest(path)["metadata"])
 
 
-def load_weights(folder: Path, name: str, loss: LossModule) -> dict[str, Any]:
-    """Load the weights of a checkpoint into a loss of the same shape.
+def load_weights(
+    folder: Path, name: str, *, loss: LossModule | None = None, average: AveragedModel | None = None
+) -> dict[str, Any]:
+    """Load the weights of a checkpoint into a loss, an averaged actor, or both, of the same shape.
 
     Returns:
         The progress that was saved with them.
@@ -51,5 +59,7 @@ def load_weights(folder: Path, name: str, loss: LossModule) -> dict[str, Any]:
         UserInputError: if there is no such checkpoint.
     """
     progress = load_manifest(folder, name)
-    Checkpoint(loss=loss).load(folder / name, components=["loss"])
+    wanted = {"loss": loss, "average": average}
+    components = {key: module for key, module in wanted.items() if module is not None}
+    Checkpoint(**components).load(folder / name, components=list(components))
     return progress

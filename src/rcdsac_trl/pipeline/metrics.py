@@ -65,6 +65,18 @@ def episode_metrics(episodes: TensorDictBase) -> dict[str, Tensor]:
     }
 
 
+def validation_score(by_condition: pd.DataFrame, episode_steps: int) -> float:
+    """Return what the best agent is chosen by: the mean reward, less 1 for every agent step in contact.
+
+    The reward charges a contact's onset alone, so an agent that leans on a wall would only seem slow.
+
+    Args:
+        by_condition: mean `reward` and `contact_fraction`, one row a condition; conditions count alike.
+        episode_steps: length of an episode.
+    """
+    return float((by_condition["reward"] - episode_steps * by_condition["contact_fraction"]).mean())
+
+
 def summarise(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     """Give mean and standard deviation (over episodes, ddof 0) of every metric, and the number of episodes.
 

@@ -213,6 +213,7 @@ class LearnerSettings:
     num_critics: int
     gamma: float
     target_coefficient: float
+    actor_average_decay: float
     actor_lr: float
     critic_lr: float
     alpha_lr: float
@@ -238,6 +239,8 @@ class LearnerSettings:
             raise UserInputError(f"learner.gamma={self.gamma} is outside [0, 1): episodes never terminate")
         if not 0 < self.target_coefficient <= 1:
             raise UserInputError(f"learner.target_coefficient={self.target_coefficient} is outside (0, 1]")
+        if not 0 <= self.actor_average_decay < 1:
+            raise UserInputError(f"learner.actor_average_decay={self.actor_average_decay} is outside [0, 1)")
         if self.max_grad_norm is not None:
             _positive("learner", self, "max_grad_norm")
 
@@ -252,11 +255,18 @@ class Schedule:
     pursuit_noise: float
     neutral_iterations: int
     ramp_iterations: int
+    decay_iterations: int
+    final_learning_rate_share: float
 
     def __post_init__(self) -> None:
         """Refuse what cannot be scheduled."""
         _at_least("schedule", self, 1, "iterations")
         _at_least("schedule", self, 0, " ".join(f.name for f in fields(self)))
+        if not 0 < self.final_learning_rate_share <= 1:
+            raise UserInputError(
+                f"schedule.final_learning_rate_share={self.final_learning_rate_share} is outside (0, 1]: "
+                "the last updates need some learning rate"
+            )
 
     def distortion_strength(self, iteration: int) -> float:
         """Return how much of beta counts in the actor's loss: 0 as if neutral, 1 all of it."""
@@ -265,3 +275,13 @@ class Schedule:
         if self.ramp_iterations == 0:
             return 1.0
         return min(1.0, (iteration - self.neutral_iterations + 1) / self.ramp_iterations)
+
+    def learning_rate_share(self, iteration: int) -> float:
+        """Return the share of the learning rates that an iteration uses; the last one uses the final share.
+
+        A run shorter than the decay begins in the middle of it.
+        """
+        if self.decay_iterations == 0:
+            return 1.0
+        decayed = max(0, iteration + 1 - (self.iterations - self.decay_iterations)) / self.decay_iterations
+        return 1.0 - decayed * (1.0 - self.final_learning_rate_share)

@@ -9,6 +9,7 @@ import pandas as pd
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
 from torchrl.collectors import Collector
 from torchrl.objectives import LossModule, SoftUpdate
 from tqdm import tqdm
@@ -16,7 +17,7 @@ from tqdm import tqdm
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
 from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.logs import RunLog
-from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics
+from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics, validation_score
 from rcdsac_trl.pipeline.replay import SequenceReplay
 from rcdsac_trl.pipeline.settings import Schedule
 
@@ -24,7 +25,7 @@ LOSS_KEYS = ("loss_qvalue", "loss_actor", "loss_alpha")
 
 
 class Learner:
-    """One update: a batch, a beta for it, one backward pass, every optimiser, the target critics.
+    """One update: a batch, a beta for it, one backward pass, every optimiser, the target critics, the average.
 
     Args:
         replay: gives batches of sequences.
@@ -32,7 +33,9 @@ class Learner:
         relabel: sets the `risk` of a batch; None: the loss reads none.
         optimizer: holds the parameters of all three losses.
         targets: moves the target critics.
-        clipped: groups of parameters whose gradient norm is clipped together, and the limit; None: no clipping.
+        clipped: groups of parameters whose gradient norm is clipped together.
+        max_grad_norm: the limit of that norm; None: no clipping.
+        average: running average of the actor's weights.
     """
 
     def __init__(
@@ -45,6 +48,7 @@ class Learner:
         targets: SoftUpdate,
         clipped: list[list[nn.Parameter]],
         max_grad_norm: float | None,
+        average: AveragedModel,
     ) -> None:
         self.replay = replay
         self.loss = loss
@@ -53,6 +57,8 @@ class Learner:
         self.targets = targets
         self.clipped = clipped
         self.max_grad_norm = max_grad_norm
+        self.average = average
+        self._learning_rates = [group["lr"] for group in optimizer.param_groups]
 
     def update(self) -> dict[str, Tensor]:
         """Do one update and return the losses and diagnostics, detached and still on the device."""
@@ -68,11 +74,20 @@ class Learner:
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.targets.step()
+        self.average.update_parameters(self.loss.actor_network)
         return {key: value.detach() for key, value in losses.items()}
 
-    def updates(self, number: int, distortion_strength: float) -> dict[str, float]:
-        """Do many updates at one distortion strength; return the mean of everything :meth:`update` returns."""
+    def updates(self, number: int, distortion_strength: float, learning_rate_share: float) -> dict[str, float]:
+        """Do many updates; return the mean of everything :meth:`update` returns.
+
+        Args:
+            number: of updates.
+            distortion_strength: how much of beta counts in the actor's loss, in [0, 1].
+            learning_rate_share: share of every learning rate that is used, in (0, 1].
+        """
         self.loss.distortion_strength = distortion_strength
+        for group, learning_rate in zip(self.optimizer.param_groups, self._learning_rates, strict=True):
+            group["lr"] = learning_rate_share * learning_rate
         sums: dict[str, Tensor] = {}
         for _ in range(number):
             for key, value in self.update().items():
@@ -154,6 +169,7 @@ class Trainer:
     def _iterate(self, iteration: int, episodes: Iterator[TensorDictBase]) -> dict[str, float]:
         self.set_iteration(iteration)
         strength = self.schedule.distortion_strength(iteration)
+        share = self.schedule.learning_rate_share(iteration)
         t0 = time.monotonic()
         batch = next(episodes)
         t1 = time.monotonic()
@@ -162,12 +178,13 @@ class Trainer:
         # Before the updates: episodes are logged under the number of updates that they were driven with.
         record = self._training_record(iteration, batch)
         t2 = time.monotonic()
-        diagnostics = self.learner.updates(self.schedule.updates_per_iteration, strength)
+        diagnostics = self.learner.updates(self.schedule.updates_per_iteration, strength, share)
         self.updates += self.schedule.updates_per_iteration
         t3 = time.monotonic()
         record |= {f"learn/{key}": value for key, value in diagnostics.items()}
         record |= {
             "learn/distortion_strength": strength,
+            "learn/learning_rate_share": share,
             "learn/updates": float(self.updates),
             "time/steps_per_s": batch.numel() / (t1 - t0),
             "time/updates_per_s": self.schedule.updates_per_iteration / max(t3 - t2, 1e-9),
@@ -206,7 +223,7 @@ class Trainer:
         conditions = ["beta", "collision_weight"]
         by_condition = rows.groupby(conditions, dropna=False)[list(METRICS)].mean()
         self.log.validation(by_condition.reset_index())
-        score = float(by_condition["reward"].mean())
+        score = validation_score(by_condition, self.validate.steps)
         if score > self.best_score:
             self.best_score = score
             self._save(iteration, best=True)

@@ -1,7 +1,8 @@
 """Networks, their loss and what updates them."""
 
 import torch
-from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from tensordict.nn import TensorDictModuleBase, TensorDictParams, TensorDictSequential
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
@@ -47,9 +48,17 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
     return loss
 
 
-def make_policy(loss: LossModule, env: EnvBase, generator: torch.Generator, device: str) -> TensorDictModuleBase:
-    """Make the acting policy; it shares the weights of the loss's actor."""
-    policy = build_policy(loss.actor_network, env.action_spec_unbatched, generator=generator)
+def make_average(loss: LossModule, learner: LearnerSettings) -> AveragedModel:
+    """Make the running average of the actor's weights; it is what is validated, evaluated and deployed."""
+    decay = learner.actor_average_decay
+    return AveragedModel(loss.actor_network, multi_avg_fn=get_ema_multi_avg_fn(decay))
+
+
+def make_policy(
+    actor: TensorDictSequential, env: EnvBase, generator: torch.Generator, device: str
+) -> TensorDictModuleBase:
+    """Make the acting policy of an actor; it shares the actor's weights."""
+    policy = build_policy(actor, env.action_spec_unbatched, generator=generator)
     return policy if device == "cpu" else OnDevice(policy, device)
 
 

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import logs, runtime
-from rcdsac_trl.pipeline.build.agent import make_loss, make_policy
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_policy
 from rcdsac_trl.pipeline.build.read import evaluation_settings, settings_of_run, training_settings
 from rcdsac_trl.pipeline.build.world import evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import load_manifest, load_weights
@@ -52,10 +52,10 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         if algo is None:
             policy: TensorDictModuleBase = PursuitPolicy()
         else:
-            loss = make_loss(trained, device)
-            load_weights(checkpoints, settings.checkpoint, loss)
+            average = make_average(make_loss(trained, device), trained.learner)
+            load_weights(checkpoints, settings.checkpoint, average=average)
             generator = torch_stream(settings.seed, "evaluation actions", device=device)
-            policy = make_policy(loss, env, generator, device)
+            policy = make_policy(average.module, env, generator, device)
         try:
             return evaluate(
                 env,

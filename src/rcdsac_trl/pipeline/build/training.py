@@ -5,12 +5,20 @@ from pathlib import Path
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 from rcdsac_trl.pipeline import logs, runtime
-from rcdsac_trl.pipeline.build.agent import make_loss, make_optimizer, make_policy, make_relabel, parameters
+from rcdsac_trl.pipeline.build.agent import (
+    make_average,
+    make_loss,
+    make_optimizer,
+    make_policy,
+    make_relabel,
+    parameters,
+)
 from rcdsac_trl.pipeline.build.read import training_settings
 from rcdsac_trl.pipeline.build.world import environment, evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
@@ -61,6 +69,7 @@ def trainer(cfg: DictConfig, folder: Path) -> Trainer:
     logs.start_run_folder(folder, cfg, facts)
 
     loss = make_loss(settings, device)
+    average = make_average(loss, settings.learner)
     optimizer = make_optimizer(loss, settings.learner)
     env = environment(
         world,
@@ -72,7 +81,7 @@ def trainer(cfg: DictConfig, folder: Path) -> Trainer:
     )
     exploration = torch.Generator(device=device)
     policy = CollectionPolicy(
-        make_policy(loss, env, exploration, device),
+        make_policy(loss.actor_network, env, exploration, device),
         generator=exploration,
         seed=settings.seed,
         pursuit_iterations=schedule.pursuit_iterations,
@@ -96,6 +105,7 @@ def trainer(cfg: DictConfig, folder: Path) -> Trainer:
         targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
         clipped=clipped,
         max_grad_norm=settings.learner.max_grad_norm,
+        average=average,
     )
     log = logs.RunLog(folder, settings.logger.backends)
     log.message(f"device {device}, {threads} threads, allocator: {runtime.allocator()}")
@@ -104,16 +114,16 @@ def trainer(cfg: DictConfig, folder: Path) -> Trainer:
         collector=collector,
         set_iteration=policy.set_iteration,
         learner=learner,
-        validate=_validation(settings, loss, device),
+        validate=_validation(settings, average.module, device),
         validate_every=settings.validation.every_iterations,
-        checkpoints=Checkpoints(folder / "checkpoints", loss, optimizer),
+        checkpoints=Checkpoints(folder / "checkpoints", loss, average, optimizer),
         checkpoint_every=settings.checkpoint.every_iterations,
         log=log,
         context_key=algo.context_key,
     )
 
 
-def _validation(settings: TrainingSettings, loss: LossModule, device: str) -> Validation:
+def _validation(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> Validation:
     algo, world = settings.algo, settings.training_world
     conditions = algo.default_conditions
     env = evaluation_environment(
@@ -121,7 +131,7 @@ def _validation(settings: TrainingSettings, loss: LossModule, device: str) -> Va
     )
     return Validation(
         env,
-        make_policy(loss, env, torch.Generator(device=device), device),
+        make_policy(actor, env, torch.Generator(device=device), device),
         conditions=conditions,
         num_agents=world.num_agents,
         num_maps=settings.validation.num_maps,
