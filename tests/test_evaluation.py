@@ -367,10 +367,9 @@ def test_a_validation_repeats_itself_and_follows_the_agent(tmp_path: Path) -> No
     trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "validation.num_maps=2")
     first, again = trainer.validate(), trainer.validate()
     pd.testing.assert_frame_equal(first, again)
-    with torch.no_grad():  # the weights are the learner's own, not a copy
-        for value in trainer.learner.loss.actor_network_params.values(True, True):
-            if isinstance(value, torch.nn.Parameter):
-                value.mul_(3.0)
+    with torch.no_grad():  # the weights are the learner's own average, not a copy
+        for value in trainer.learner.average.module.parameters():
+            value.mul_(3.0)
     assert not trainer.validate()["reward"].equals(first["reward"])
     trainer.validate.close()
     trainer.validate.close()  # once more does no harm

@@ -91,6 +91,7 @@ EXPECTED_SCALARS = {
     *(f"learn/loss_{name}" for name in ("qvalue", "actor", "alpha")),
     *(f"learn/{name}" for name in ("alpha", "entropy", "td_error", "q_value", "quantile_spread")),
     "learn/distortion_strength",
+    "learn/learning_rate_share",
     "learn/updates",
     "time/elapsed_s",
     "time/steps_per_s",
