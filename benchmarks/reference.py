@@ -1,8 +1,8 @@
 """The learner as one writes it plainly with TorchRL: what the fast path is measured against, and tested against.
 
-The same networks and losses as :mod:`rcdsac_trl.agent`, from ordinary layers: ``Conv1d``, TorchRL's ``GRUModule``, a risk
-gate that is one linear layer over both embeddings for every transition and fraction. Every network is called on the
-observations whenever its output is needed, so encoders run again for current and next step, for data and policy
+The same networks and losses as :mod:`rcdsac_trl.agent`, from ordinary layers: ``Conv1d``, TorchRL's ``GRUModule``, a
+risk gate that is one linear layer over both embeddings for every transition and fraction. Every network is called on
+the observations whenever its output is needed, so encoders run again for current and next step, for data and policy
 action. It draws its random numbers in the product's order: the same generator gives the same losses.
 """
 
@@ -85,9 +85,7 @@ class Critic(nn.Module):
             weights = [head.gate_tau.weight] if self.measure is None else [head.gate_beta.weight, head.gate_tau.weight]
             self.gate = Gate(weights, head.gate_tau.bias)
 
-    def forward(
-        self, memory: Tensor, action: Tensor, tau: Tensor | None = None, risk: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, memory: Tensor, action: Tensor, tau: Tensor | None = None, risk: Tensor | None = None) -> Tensor:
         x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
         if tau is None:
             return self.output(F.relu(self.hidden(x)))

@@ -14,7 +14,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl.objectives.utils import ValueEstimators
 
 from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
-from rcdsac_trl.agent.functional import quantile_huber_loss, squash
+from rcdsac_trl.agent.functional import _quantile_huber_pairwise, quantile_huber_loss, squash
 from rcdsac_trl.agent.losses import DistributionalSACLoss
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
@@ -80,6 +80,18 @@ def test_quantile_huber_sums_over_predictions_and_averages_over_targets() -> Non
                         huber = 0.5 * x * x if abs(x) <= kappa else kappa * (abs(x) - 0.5 * kappa)
                         expected[b, t] += abs(float(tau[b, 0, i]) - (x < 0)) * huber / kappa / 5
         torch.testing.assert_close(quantile_huber_loss(quantiles, targets, tau, kappa), expected)
+
+
+@pytest.mark.parametrize("kappa", [0.3, 1.0])
+def test_quantile_huber_kernel_equals_ordinary_operations(kappa: float) -> None:
+    quantiles = torch.randn(3, 5, 4, dtype=torch.float64, requires_grad=True)
+    targets, tau = torch.randn(3, 5, 6, dtype=torch.float64), torch.rand(3, 1, 4, dtype=torch.float64)
+    found, expected = (f(quantiles, targets, tau, kappa) for f in (quantile_huber_loss, _quantile_huber_pairwise))
+    torch.testing.assert_close(found, expected)
+    weights = torch.rand(3, 5, dtype=torch.float64)
+    slopes = [torch.autograd.grad((loss * weights).sum(), quantiles)[0] for loss in (found, expected)]
+    torch.testing.assert_close(*slopes)
+    assert torch.autograd.gradcheck(lambda q: quantile_huber_loss(q, targets, tau, kappa), (quantiles,))
 
 
 def test_quantile_huber_is_least_at_the_quantile() -> None:

@@ -5,14 +5,22 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from rcdsac_trl.agent import kernels
+from rcdsac_trl.agent import kernels, quantile_kernels
 from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic, build_policy
-from rcdsac_trl.agent.networks import ActorHead, Encoder, QuantileHead, RangeFeatures, ScalarHead, Widths
+from rcdsac_trl.agent.networks import (
+    FEW_OBSERVATIONS,
+    ActorHead,
+    Encoder,
+    QuantileHead,
+    RangeFeatures,
+    ScalarHead,
+    Widths,
+)
 from rcdsac_trl.agent.risk import CVaR, PowerLaw
 from rcdsac_trl.errors import UserInputError
 
@@ -37,10 +45,16 @@ def gradients(output: Tensor, inputs: list[Tensor]) -> list[Tensor]:
 
 
 # ------------------------------------------------------------------------------------------------ kernels
-@pytest.mark.parametrize("number", [1, kernels._OBSERVATIONS_PER_BLOCK, 2 * kernels._OBSERVATIONS_PER_BLOCK + 3])
-def test_range_features_equal_the_layers(number: int) -> None:
+BLOCK = kernels._ROWS_PER_BLOCK // 44
+NARROW = [*range(21), *range(158, 180)]
+
+
+@pytest.mark.parametrize("number", [FEW_OBSERVATIONS, BLOCK, 2 * BLOCK + 3])
+@pytest.mark.parametrize("heard", [list(range(180)), NARROW, [90], list(range(9, 180, 10)), []])
+def test_range_features_equal_the_layers(number: int, heard: list[int]) -> None:
     module = RangeFeatures(6, 16).double()
-    bins = torch.rand(number, 180, dtype=torch.float64)
+    bins = torch.zeros(number, 180, dtype=torch.float64)
+    bins[:, heard] = torch.rand(number, len(heard), dtype=torch.float64)
     fast, plain = module(bins), module.layers(bins)
     torch.testing.assert_close(fast, plain)
     parameters = list(module.parameters())
@@ -49,33 +63,51 @@ def test_range_features_equal_the_layers(number: int) -> None:
         torch.testing.assert_close(module(bins), plain)
 
 
-def plain_gated_values(x: Tensor, gate: Tensor, hidden: nn.Linear, output: nn.Linear) -> Tensor:
-    return output(F.relu(hidden(x.unsqueeze(2) * gate))).squeeze(-1)
+def test_silent_bins_are_left_out() -> None:
+    bins = torch.zeros(3, 180)
+    assert kernels._heard(bins + 1.0, 5) == [(0, 43)]
+    # Bins 0..20 reach positions 0..10 of the first convolution and 0..5 of the second; 158..179 reach 77..87, 38..42.
+    bins[1, NARROW] = 1.0
+    assert kernels._heard(bins, 5) == [(0, 6), (38, 43)]
+    # Bin 0 reaches position 0, bin 14 reaches 2 and 3; the one between costs nothing.
+    assert kernels._heard(torch.eye(180)[[0, 14]], 5) == [(0, 4)]
+    assert kernels._heard(0.0 * bins, 5) == [(0, 1)]
 
 
-@pytest.mark.parametrize(("sequences", "steps"), [(1, 1), (7, 3), (70, 8), (3, 300)])
-@pytest.mark.parametrize("shared", [True, False])
+def quantile_head(steps: int, tau_steps: int, risk_steps: int, *, frozen: bool) -> tuple[QuantileHead, list[Tensor]]:
+    """Make a head and its kernel's inputs: features, fractions, beta's part of the gate."""
+    head = QuantileHead(2, SMALL, PowerLaw()).double().requires_grad_(not frozen)
+    sequences = 1 + quantile_kernels._ROWS_PER_BLOCK // (4 * steps)  # more than a block
+    x = torch.randn(sequences, steps, SMALL.head, dtype=torch.float64, requires_grad=True)
+    tau = torch.rand(sequences, tau_steps, 4, dtype=torch.float64)
+    beta = torch.randn(sequences, risk_steps, SMALL.head, dtype=torch.float64, requires_grad=not frozen)
+    return head, [x, tau, beta]
+
+
+@pytest.mark.parametrize("steps", [1, 3, 300])
+@pytest.mark.parametrize("tau_shared", [True, False])
+@pytest.mark.parametrize("risk_shared", [True, False])
 @pytest.mark.parametrize("frozen", [True, False])
-def test_gated_values_equal_the_layers(sequences: int, steps: int, shared: bool, frozen: bool) -> None:
-    hidden, output = nn.Linear(6, 5).double(), nn.Linear(5, 1).double()
-    x = torch.randn(sequences, steps, 6, dtype=torch.float64, requires_grad=True)
-    gate = torch.randn(sequences, 1 if shared else steps, 4, 6, dtype=torch.float64, requires_grad=not frozen)
-    parameters = [*hidden.parameters(), *output.parameters()]
-    for parameter in parameters:
-        parameter.requires_grad_(not frozen)
-    inputs = [x] if frozen else [x, gate, *parameters]
-    fast, plain = kernels.gated_values(x, gate, hidden, output), plain_gated_values(x, gate, hidden, output)
+def test_quantile_values_equal_the_layers(steps: int, tau_shared: bool, risk_shared: bool, frozen: bool) -> None:
+    head, (x, tau, beta) = quantile_head(steps, 1 if tau_shared else steps, 1 if risk_shared else steps, frozen=frozen)
+    layers = (head.gate_tau, head.hidden, head.output)
+    fast = quantile_kernels.quantile_values(x, tau, beta, head.cosines.frequencies, *layers)
+    plain = head.layers(x, tau, beta)
     torch.testing.assert_close(fast, plain)
+    inputs = [x] if frozen else [x, beta, *(p for layer in layers for p in layer.parameters())]
     torch.testing.assert_close(gradients(fast, inputs), gradients(plain, inputs))
+    with torch.no_grad():
+        torch.testing.assert_close(
+            quantile_kernels.quantile_values(x, tau, beta, head.cosines.frequencies, *layers), plain
+        )
 
 
-def test_kernels_against_finite_differences() -> None:
-    hidden, output = nn.Linear(3, 4).double(), nn.Linear(4, 1).double()
-    x = torch.randn(2, 2, 3, dtype=torch.float64, requires_grad=True)
-    gate = torch.randn(2, 1, 3, 3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        kernels._GatedValues.apply, (x, gate, hidden.weight, hidden.bias, output.weight, output.bias)
-    )
+@pytest.mark.parametrize("risk_steps", [1, 2])
+def test_quantile_values_against_finite_differences(risk_steps: int) -> None:
+    head, (x, tau, beta) = quantile_head(2, 1, risk_steps, frozen=False)
+    parameters = [p for layer in (head.gate_tau, head.hidden, head.output) for p in layer.parameters()]
+    inputs = (x[:2].detach().requires_grad_(), tau[:2], beta[:2].detach().requires_grad_(), head.cosines.frequencies)
+    assert torch.autograd.gradcheck(quantile_kernels._QuantileValues.apply, (*inputs, *parameters))
 
 
 def test_range_features_export_as_plain_layers() -> None:

@@ -16,6 +16,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from rcdsac_trl.agent.quantile_kernels import quantile_huber
+
 
 def quantile_huber_loss(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
     r"""Quantile regression by pairwise Huber errors, as the paper normalises it.
@@ -40,6 +42,13 @@ def quantile_huber_loss(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: 
         >>> quantile_huber_loss(torch.zeros(1), torch.tensor([2.0]), torch.tensor([0.25]))
         tensor(0.3750)
     """
+    if quantiles.device.type == "cpu":
+        return quantile_huber(quantiles, targets, tau, kappa)
+    return _quantile_huber_pairwise(quantiles, targets, tau, kappa)
+
+
+def _quantile_huber_pairwise(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float) -> Tensor:
+    """Compute the loss by ordinary operations on every pair."""
     shape = torch.broadcast_shapes(quantiles.unsqueeze(-1).shape, targets.unsqueeze(-2).shape)
     prediction, target = quantiles.unsqueeze(-1).expand(shape), targets.unsqueeze(-2).expand(shape)
     huber = F.huber_loss(prediction, target, reduction="none", delta=kappa)

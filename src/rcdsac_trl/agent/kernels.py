@@ -1,15 +1,14 @@
-r"""The two hot pieces of the networks, each with its backward pass written out.
+r"""The range observation's layers on a CPU, with their backward pass written out.
 
 They compute exactly what ordinary layers do (tests hold them against those, and against finite differences) and exist
 because on a CPU an update spends its time moving memory, not multiplying: every intermediate of a batch
-of 6,500 observations or 100,000 quantiles is tens of megabytes, written and read again by the next operation. Here a
-batch goes through all layers in blocks that stay in the cache and activations are rectified in place: 2 to 4 times
-faster on batches of that size, and on small ones no slower.
+of 6,500 observations is tens of megabytes, written and read again by the next operation. Here a batch goes through all
+layers in blocks that stay in the cache, activations are rectified in place, and bins that are silent in the whole
+batch, such as those a narrow sensor lacks, are left out.
 
 Public names::
 
     range_features(bins [n,180], conv_1, conv_2, linear) -> [n, features]
-    gated_values(x [B,L,H], gate [B,L|1,N,H], hidden, output) -> [B,L,N]
 """
 
 from typing import Any
@@ -19,10 +18,9 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-# Observations, and rows of (transition, quantile), that go through the layers together: their activations take about
-# 1 MB, which a core's own cache holds.
-_OBSERVATIONS_PER_BLOCK = 96
-_ROWS_PER_BLOCK = 1024
+# Rows of two positions that go through the layers together: their activations take about 1 MB, which a core's own
+# cache holds.
+_ROWS_PER_BLOCK = 96 * 44
 
 
 def _rectify_gradient(gradient: Tensor, activation: Tensor) -> Tensor:
@@ -32,80 +30,128 @@ def _rectify_gradient(gradient: Tensor, activation: Tensor) -> Tensor:
 
 # ------------------------------------------------------------------------------------------------ range features
 class _RangeFeatures(torch.autograd.Function):
-    """Convolution 5/2, convolution 3/2, linear layer, each rectified; activations are [n, position, channel].
+    """Convolution 5/2, convolution 3/2, linear layer, each rectified; activations are [n, row, channel].
 
-    The first convolution multiplies its windows, which carry a 1 for the bias. In the second a window is contiguous
-    memory: with two positions to a row, it is one whole row and the first half of the next. That leaves one
-    position too many at the end of every observation; the linear layer's weight is zero there.
+    A row is two positions of the first convolution. The second one's window is contiguous memory, a row and the first
+    half of the next, so that a run of its positions [a, b) takes the rows a .. b; the position of row b is one too
+    many, and the linear layer's weight is zero there. Positions outside all runs see silent bins alone: their
+    activation is the same for every observation, and joins the linear layer's bias.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, bins: Tensor, w1: Tensor, b1: Tensor, w2: Tensor, b2: Tensor, w3: Tensor, b3: Tensor
+        ctx: Any,
+        bins: Tensor,
+        w1: Tensor,
+        b1: Tensor,
+        w2: Tensor,
+        b2: Tensor,
+        w3: Tensor,
+        b3: Tensor,
+        runs: list[tuple[int, int]],
     ) -> Tensor:
         channels, taps = w1.shape[0], w1.shape[2]
-        positions = (bins.shape[1] - taps) // 2 + 1
         kernel_1 = torch.cat((w1.view(channels, taps), b1.unsqueeze(1)), dim=1).t().contiguous()
         kernel_2 = w2.permute(2, 1, 0)
         pair, third = kernel_2[:2].reshape(2 * channels, channels), kernel_2[2].contiguous()
-        padded = F.pad(w3, (0, positions // 2 * channels - w3.shape[1]))
+        by_position = w3.view(w3.shape[0], -1, channels)
+        kernel_3 = torch.cat([F.pad(by_position[:, a:b], (0, 0, 0, 1)) for a, b in runs], dim=1).flatten(1)
+        silent_1 = b1.relu()
+        silent_2 = (b2 + w2.sum(-1) @ silent_1).relu()
+        gaps = zip([0, *(b for _, b in runs)], [*(a for a, _ in runs), by_position.shape[1]], strict=True)
+        silent_3 = torch.cat([by_position[:, a:b] for a, b in gaps], dim=1).sum(1)
+        bias_3 = b3 + silent_3 @ silent_2
         result = bins.new_empty(bins.shape[0], w3.shape[0])
         saved: list[Tensor] = []
-        for start in range(0, bins.shape[0], _OBSERVATIONS_PER_BLOCK):
-            block = bins[start : start + _OBSERVATIONS_PER_BLOCK]
-            windows = _windows(block, taps, positions)
-            first = torch.mm(windows, kernel_1).relu_()
+        block_size = _block_size(runs)
+        for start in range(0, bins.shape[0], block_size):
+            block = bins[start : start + block_size]
+            first = torch.mm(_windows(block, taps, runs), kernel_1).relu_()
             rows = first.view(-1, 2 * channels)
             second = torch.addmm(b2, rows, pair)
             second[:-1].addmm_(rows[1:, :channels], third)
             second.relu_()
-            out = result[start : start + _OBSERVATIONS_PER_BLOCK]
-            torch.addmm(b3, second.view(block.shape[0], -1), padded.t(), out=out).relu_()
+            out = result[start : start + block_size]
+            torch.addmm(bias_3, second.view(block.shape[0], -1), kernel_3.t(), out=out).relu_()
             if any(ctx.needs_input_grad):
                 saved += [first, second]
-        ctx.save_for_backward(bins, pair, third, padded, result, *saved)
-        ctx.shapes = (w1.shape, w2.shape, w3.shape)
+        ctx.save_for_backward(bins, w2, pair, third, kernel_3, silent_1, silent_2, silent_3, result, *saved)
+        ctx.shapes, ctx.runs = (w1.shape, by_position.shape), runs
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        bins, pair, third, padded, result, *saved = ctx.saved_tensors
-        shape_1, shape_2, shape_3 = ctx.shapes
+        bins, w2, pair, third, kernel_3, silent_1, silent_2, silent_3, result, *saved = ctx.saved_tensors
+        (shape_1, shape_3), runs = ctx.shapes, ctx.runs
         channels, taps = shape_1[0], shape_1[2]
-        positions = (bins.shape[1] - taps) // 2 + 1
         gradient = torch.ops.aten.threshold_backward(gradient, result, 0)
         d_kernel_1 = bins.new_zeros(taps + 1, channels)
         d_pair, d_third = torch.zeros_like(pair), torch.zeros_like(third)
-        d_b2, d_padded = bins.new_zeros(channels), torch.zeros_like(padded)
-        for index, start in enumerate(range(0, bins.shape[0], _OBSERVATIONS_PER_BLOCK)):
+        d_b2, d_kernel_3 = bins.new_zeros(channels), torch.zeros_like(kernel_3)
+        block_size = _block_size(runs)
+        for index, start in enumerate(range(0, bins.shape[0], block_size)):
             first, second = saved[2 * index], saved[2 * index + 1]
-            out = gradient[start : start + _OBSERVATIONS_PER_BLOCK]
+            out = gradient[start : start + block_size]
             rows = first.view(-1, 2 * channels)
-            d_padded.addmm_(out.t(), second.view(out.shape[0], -1))
-            d_second = _rectify_gradient(torch.mm(out, padded).view(-1, channels), second)
+            d_kernel_3.addmm_(out.t(), second.view(out.shape[0], -1))
+            d_second = _rectify_gradient(torch.mm(out, kernel_3).view(-1, channels), second)
             d_b2 += d_second.sum(0)
             d_pair.addmm_(rows.t(), d_second)
             d_third.addmm_(rows[1:, :channels].t(), d_second[:-1])
             d_rows = torch.mm(d_second, pair.t())
             d_rows[1:, :channels].addmm_(d_second[:-1], third.t())
             d_first = _rectify_gradient(d_rows.view(-1, channels), first)
-            windows = _windows(bins[start : start + _OBSERVATIONS_PER_BLOCK], taps, positions)
-            d_kernel_1.addmm_(windows.t(), d_first)
-        d_w1 = d_kernel_1[:taps].t().reshape(shape_1)
-        d_w2 = torch.cat((d_pair.view(2, channels, channels), d_third.unsqueeze(0))).permute(2, 1, 0).reshape(shape_2)
-        return None, d_w1, d_kernel_1[taps], d_w2, d_b2, d_padded[:, : shape_3[1]], gradient.sum(0)
+            d_kernel_1.addmm_(_windows(bins[start : start + block_size], taps, runs).t(), d_first)
+        d_w1, d_b1 = d_kernel_1[:taps].t().reshape(shape_1), d_kernel_1[taps]
+        d_w2 = torch.cat((d_pair.view(2, channels, channels), d_third.unsqueeze(0))).permute(2, 1, 0)
+        d_b3 = gradient.sum(0)
+        # What the silent positions add to the linear layer's bias, backwards.
+        d_w3 = torch.outer(d_b3, silent_2).unsqueeze(1).expand(shape_3).contiguous()
+        d_silent_2 = _rectify_gradient(d_b3 @ silent_3, silent_2)
+        d_silent_1 = _rectify_gradient(d_silent_2 @ w2.sum(-1), silent_1)
+        row = 0
+        for a, b in runs:
+            d_w3[:, a:b] = d_kernel_3.view(shape_3[0], -1, channels)[:, row : row + b - a]
+            row += b - a + 1
+        d_w2 = d_w2 + torch.outer(d_silent_2, silent_1).unsqueeze(-1)
+        return None, d_w1, d_b1 + d_silent_1, d_w2, d_b2 + d_silent_2, d_w3.flatten(1), d_b3, None
 
 
-def _windows(block: Tensor, taps: int, positions: int) -> Tensor:
-    """Return every window of the first convolution with a 1 appended, ``[n * positions, taps + 1]``."""
-    windows = block.new_ones(block.shape[0], positions, taps + 1)
-    windows[..., :taps] = block.unfold(-1, taps, 2)
+def _block_size(runs: list[tuple[int, int]]) -> int:
+    """Return how many observations go through the layers together."""
+    return max(1, _ROWS_PER_BLOCK // sum(b - a + 1 for a, b in runs))
+
+
+def _windows(block: Tensor, taps: int, runs: list[tuple[int, int]]) -> Tensor:
+    """Return the windows of the first convolution that the runs need, a 1 appended, ``[n * positions, taps + 1]``."""
+    windows = block.new_ones(block.shape[0], 2 * sum(b - a + 1 for a, b in runs), taps + 1)
+    every, position = block.unfold(-1, taps, 2), 0
+    for a, b in runs:
+        number = 2 * (b - a + 1)
+        windows[:, position : position + number, :taps] = every[:, 2 * a : 2 * a + number]
+        position += number
     return windows.view(-1, taps + 1)
+
+
+def _heard(bins: Tensor, taps: int) -> list[tuple[int, int]]:
+    """Return the runs [a, b) of the second convolution's positions that see a bin which is not 0 in all the batch."""
+    first = (bins != 0).any(0).unfold(0, taps, 2).any(-1)
+    positions = first.unfold(0, 3, 2).any(-1).nonzero().flatten().tolist()
+    runs: list[tuple[int, int]] = []
+    for position in positions:
+        # A gap of one position costs no less than the position.
+        if runs and position <= runs[-1][1] + 1:
+            runs[-1] = (runs[-1][0], position + 1)
+        else:
+            runs.append((position, position + 1))
+    return runs or [(0, 1)]
 
 
 def range_features(bins: Tensor, conv_1: nn.Conv1d, conv_2: nn.Conv1d, linear: nn.Linear) -> Tensor:
     """Return the rectified ``linear(conv_2(conv_1(bins)))`` with rectifiers between, ``[n, features]``.
+
+    Bins that are 0 in the whole batch cost nothing where their windows hold no other: a narrow sensor's do.
 
     Args:
         bins: ``[n, bins]``; data, so no gradient flows to it.
@@ -113,77 +159,7 @@ def range_features(bins: Tensor, conv_1: nn.Conv1d, conv_2: nn.Conv1d, linear: n
         conv_2: kernel 3, stride 2.
         linear: reads the positions of ``conv_2``, position by position.
     """
+    runs = _heard(bins, conv_1.kernel_size[0])
     return _RangeFeatures.apply(
-        bins, conv_1.weight, conv_1.bias, conv_2.weight, conv_2.bias, linear.weight, linear.bias
+        bins, conv_1.weight, conv_1.bias, conv_2.weight, conv_2.bias, linear.weight, linear.bias, runs
     )
-
-
-# ------------------------------------------------------------------------------------------------ gated values
-class _GatedValues(torch.autograd.Function):
-    """``output(relu(hidden(x * gate)))`` with x broadcast over quantiles and the gate, where constant, over time."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, gate: Tensor, weight: Tensor, bias: Tensor, out_weight: Tensor, out_bias: Tensor
-    ) -> Tensor:
-        number, (sequences, steps, size) = gate.shape[2], x.shape
-        result = x.new_empty(sequences, steps, number)
-        block = max(1, _ROWS_PER_BLOCK // (steps * number))
-        saved = []
-        for start in range(0, sequences, block):
-            part = slice(start, start + block)
-            product = (x[part].unsqueeze(2) * gate[part]).view(-1, size)
-            hidden = torch.addmm(bias, product, weight.t()).relu_()
-            torch.addmv(out_bias, hidden, out_weight.view(-1), out=result[part].view(-1))
-            if any(ctx.needs_input_grad):
-                saved.append(hidden)
-        ctx.save_for_backward(x, gate, weight, out_weight, *saved)
-        return result
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        x, gate, weight, out_weight, *saved = ctx.saved_tensors
-        need_x, need_gate, need_weight = ctx.needs_input_grad[:3]
-        d_x, d_gate = torch.empty_like(x), torch.empty_like(gate)
-        d_weight, d_bias = torch.zeros_like(weight), x.new_zeros(weight.shape[0])
-        d_out_weight = torch.zeros_like(out_weight).view(-1)
-        gradient = gradient.contiguous()
-        block = max(1, _ROWS_PER_BLOCK // (x.shape[1] * gate.shape[2]))
-        for index, hidden in enumerate(saved):
-            part = slice(index * block, (index + 1) * block)
-            out = gradient[part].view(-1)
-            features, factors = x[part].unsqueeze(2), gate[part]
-            d_hidden = _rectify_gradient(torch.outer(out, out_weight.view(-1)), hidden)
-            if need_weight:
-                d_out_weight.addmv_(hidden.t(), out)
-                d_bias += d_hidden.sum(0)
-                d_weight.addmm_(d_hidden.t(), (features * factors).view(d_hidden.shape[0], -1))
-            d_product = torch.mm(d_hidden, weight).view(*gradient[part].shape, -1)
-            if need_gate:
-                if gate.shape[1] == 1:
-                    torch.sum(d_product * features, dim=1, keepdim=True, out=d_gate[part])
-                else:
-                    torch.mul(d_product, features, out=d_gate[part])
-            if need_x:
-                torch.sum(d_product.mul_(factors), dim=2, out=d_x[part])
-        return (
-            d_x if need_x else None,
-            d_gate if need_gate else None,
-            d_weight if need_weight else None,
-            d_bias if need_weight else None,
-            d_out_weight.view_as(out_weight) if need_weight else None,
-            gradient.sum().view(1) if need_weight else None,
-        )
-
-
-def gated_values(x: Tensor, gate: Tensor, hidden: nn.Linear, output: nn.Linear) -> Tensor:
-    """Return ``output(relu(hidden(x * gate)))``, ``[B, L, N]``.
-
-    Args:
-        x: features of a transition ``[B, L, H]``.
-        gate: one gate a quantile, ``[B, L, N, H]``, or ``[B, 1, N, H]`` where it is constant along a sequence.
-        hidden: linear layer H to H'; either all four parameters take a gradient or none does.
-        output: linear layer H' to 1.
-    """
-    return _GatedValues.apply(x, gate, hidden.weight, hidden.bias, output.weight, output.bias)

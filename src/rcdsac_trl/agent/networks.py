@@ -29,7 +29,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rcdsac_trl.agent.kernels import gated_values, range_features
+from rcdsac_trl.agent.kernels import range_features
+from rcdsac_trl.agent.quantile_kernels import quantile_values
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 
@@ -37,6 +38,13 @@ from rcdsac_trl.errors import UserInputError
 RANGE_SIZE = 180
 #: Bounds of the policy's log standard deviation.
 LOG_STD_RANGE = (-20.0, 2.0)
+#: Below this number, one call of a layer costs more than what it computes.
+FEW_OBSERVATIONS = 32
+
+
+def _runs_kernels(x: Tensor) -> bool:
+    """Return whether our kernels know the place: a CPU, and no exporter, which knows layers only."""
+    return x.device.type == "cpu" and not torch.compiler.is_compiling() and not torch.jit.is_tracing()
 
 
 @dataclass(frozen=True)
@@ -86,12 +94,12 @@ class RangeFeatures(nn.Module):
 
     def forward(self, bins: Tensor) -> Tensor:
         """Map ``[n, 180]`` to ``[n, features]``; no gradient flows to the bins."""
-        if torch.compiler.is_exporting() or torch.jit.is_tracing():
+        if not _runs_kernels(bins) or len(bins) < FEW_OBSERVATIONS:
             return self.layers(bins)
         return range_features(bins, self.conv_1, self.conv_2, self.linear)
 
     def layers(self, bins: Tensor) -> Tensor:
-        """Compute the same with the layers one by one, for exporters, which know these and not our kernel."""
+        """Compute the same with the layers one by one."""
         positions = F.relu(self.conv_2(F.relu(self.conv_1(bins.unsqueeze(1)))))
         return F.relu(self.linear(positions.transpose(1, 2).flatten(1)))
 
@@ -234,13 +242,21 @@ class QuantileHead(nn.Module):
             tau: fractions in [0, 1], ``[B, L, N]`` or, the same along a sequence, ``[B, 1, N]``.
             risk: ``beta``, ``[B, L, 1]`` or ``[B, 1, 1]``; not read without a measure.
         """
-        gate = self.gate_tau(self.cosines(tau))
-        if self.measure is not None:
-            if risk is None:
-                raise ValueError("this critic is conditioned on risk: pass it")
-            gate = gate + self.gate_beta(self.cosines(self.measure.embed(risk)))
         x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
-        return gated_values(x, F.relu(gate).expand(len(x), -1, -1, -1), self.hidden, self.output)
+        if self.measure is None:
+            beta = x.new_zeros(len(x), 1, x.shape[-1])
+        elif risk is None:
+            raise ValueError("this critic is conditioned on risk: pass it")
+        else:
+            beta = self.gate_beta(self.cosines(self.measure.embed(risk).squeeze(-1)))
+        if not _runs_kernels(x):
+            return self.layers(x, tau, beta)
+        return quantile_values(x, tau, beta, self.cosines.frequencies, self.gate_tau, self.hidden, self.output)
+
+    def layers(self, x: Tensor, tau: Tensor, beta: Tensor) -> Tensor:
+        """Compute features ``[B, L, H]`` and beta's part of the gate to quantiles, with the layers one by one."""
+        gate = F.relu(self.gate_tau(self.cosines(tau)) + beta.unsqueeze(2))
+        return self.output(F.relu(self.hidden(x.unsqueeze(2) * gate))).squeeze(-1)
 
 
 class ScalarHead(nn.Module):

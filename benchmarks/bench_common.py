@@ -1,0 +1,87 @@
+"""What the benchmarks share: learners on made-up episodes, the machine's matrix-product rate, output."""
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_optimizer, make_relabel, parameters
+from rcdsac_trl.pipeline.build.read import training_settings
+from rcdsac_trl.pipeline.build.training import make_replay
+from rcdsac_trl.pipeline.cli import compose
+from rcdsac_trl.pipeline.trainer import Learner
+from rcdsac_trl.seeding import torch_stream
+from rcdsac_trl.world.lidar import sensor_mask
+
+EPISODES = 20
+
+
+def make_learner(algo: str, overrides: list[str]) -> Learner:
+    """Make the learner of a training, its replay filled with random episodes of the configured sensor."""
+    settings = training_settings(compose("train", [f"+algo={algo}", *overrides, "replay.capacity_steps=20000"]))
+    replay = make_replay(settings, "cpu")
+    mask = torch.from_numpy(sensor_mask(settings.sensor.name))
+    replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask))
+    loss = make_loss(settings, "cpu")
+    return Learner(
+        replay=replay,
+        loss=loss,
+        relabel=make_relabel(settings, "cpu"),
+        optimizer=make_optimizer(loss, settings.learner),
+        targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
+        clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],
+        max_grad_norm=settings.learner.max_grad_norm,
+        average=make_average(loss, settings.learner),
+    )
+
+
+def random_episodes(number: int, steps: int, mask: torch.Tensor) -> TensorDict:
+    """Return episodes ``[number, steps]`` of noise, as a collector would."""
+    generator = torch_stream(0, "benchmark")
+
+    def uniform(*size: int) -> torch.Tensor:
+        return torch.rand(number, steps, *size, generator=generator)
+
+    def observations() -> dict[str, torch.Tensor]:
+        # A third of the bins is out of range, which reads 0.
+        ranges = (0.5 + 2.4 * uniform(180)) * (uniform(180) > 1 / 3) * mask
+        return {"range": ranges, "waypoint": uniform(6), "velocity": uniform(4)}
+
+    outcome = observations() | {"reward_components": -uniform(5)}
+    content = observations() | {"action": 2.0 * uniform(2) - 1.0, "risk": -uniform(1), "next": outcome}
+    return TensorDict(content, batch_size=[number, steps])
+
+
+def seconds(call: Callable[[], Any], repeats: int) -> float:
+    """Return the mean wall time of a call."""
+    start = time.perf_counter()
+    for _ in range(repeats):
+        call()
+    return (time.perf_counter() - start) / repeats
+
+
+def gemm_peak() -> float:
+    """Return the float32 operations per second of a large square matrix product, with torch's current threads."""
+    size = 2048
+    a, b = torch.randn(size, size), torch.randn(size, size)
+    torch.mm(a, b)
+    return 2 * size**3 / min(seconds(lambda: torch.mm(a, b), 2) for _ in range(5))
+
+
+def median(values: list[float]) -> float:
+    """Return the median, as everything here is reported."""
+    return statistics.median(values)
+
+
+def report(result: dict[str, Any], table: str, *, as_json: bool, out: Path | None) -> None:
+    """Print a table, or exactly one JSON object; also write that object to a file when asked."""
+    print(json.dumps(result) if as_json else table)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(json.dumps(result, indent=2) + "\n")

@@ -1,0 +1,232 @@
+"""Updates per second of the learner and of a plain TorchRL one, side by side, and where the time goes.
+
+Run ``python benchmarks/learner.py`` for a table, ``--json`` for one JSON object. Each learner has a process of its own,
+since the product sets up its allocator at a process's start and the reference keeps the system's; they take turns,
+so that whatever else the machine does meets all of them, and medians over the turns are reported.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rcdsac_trl.pipeline import runtime
+
+# Mini-batch: overrides of the training's config, updates in a turn, turns.
+BATCHES: dict[str, tuple[list[str], int, int]] = {
+    "paper": (["preset=paper"], 1, 5),
+    "laptop": (["preset=laptop"], 8, 9),
+}
+#: Which learners take turns: name to (registry row, whether it is the product's).
+PLAYERS = {"product": ("rcdsac_pow", True), "reference": ("rcdsac_pow", False), "sac": ("sac", True)}
+
+
+# ------------------------------------------------------------------------------------------------ the parent
+class Player:
+    """A process that does updates when told to.
+
+    Args:
+        name: key of :data:`PLAYERS`.
+        overrides: of the training's config.
+    """
+
+    def __init__(self, name: str, overrides: list[str]) -> None:
+        clean = {key: value for key, value in os.environ.items() if not key.startswith("MALLOC_")}
+        self.process = subprocess.Popen(
+            [sys.executable, __file__, "--player", name, *overrides],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=clean,
+        )
+
+    def ask(self, what: str, number: int = 0) -> Any:
+        """Send a question, wait for its answer."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps([what, number]) + "\n")
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.communicate()
+
+
+def compare(overrides: list[str], updates: int, turns: int) -> dict[str, Any]:
+    """Let all players take turns on one mini-batch."""
+    from bench_common import median
+
+    players = {name: Player(name, overrides) for name in PLAYERS}
+    took: dict[str, list[float]] = {name: [] for name in players}
+    peaks = []
+    try:
+        for player in players.values():
+            player.ask("updates", 2)  # compiled passes, optimiser states
+        for _ in range(turns):
+            for name, player in players.items():
+                took[name].append(player.ask("updates", updates) / updates)
+            peaks.append(players["product"].ask("peak"))
+        flops = players["product"].ask("flops")
+        facts = players["product"].ask("facts")
+        parts = players["product"].ask("parts", 3 * updates)
+    finally:
+        for player in players.values():
+            player.close()
+    typical = {name: median(values) for name, values in took.items()}
+    return facts | {
+        "updates_per_second": 1.0 / typical["product"],
+        "reference_updates_per_second": 1.0 / typical["reference"],
+        "speedup": median([slow / fast for slow, fast in zip(took["reference"], took["product"], strict=True)]),
+        "sac_ratio": median([ours / sac for ours, sac in zip(took["product"], took["sac"], strict=True)]),
+        "gflop_per_update": flops / 1e9,
+        "gemm_peak_gflops": median(peaks) / 1e9,
+        "gemm_fraction": median([flops / t / peak for t, peak in zip(took["product"], peaks, strict=True)]),
+        "milliseconds_by_part": parts,
+    }
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """Return the results as text."""
+    lines = []
+    for name, result in results.items():
+        lines += [
+            f"{name}: {result['sequences']} sequences x {result['steps']}, {result['threads']} threads, "
+            f"allocator: {result['allocator']}",
+            f"  {result['updates_per_second']:.2f} updates/s, the reference "
+            f"{result['reference_updates_per_second']:.2f}: {result['speedup']:.1f} times as fast; "
+            f"{result['sac_ratio']:.2f} times as long as an update of SAC",
+            f"  {result['gflop_per_update']:.1f} GFLOP an update: {100 * result['gemm_fraction']:.0f} % of the "
+            f"{result['gemm_peak_gflops']:.0f} GFLOP/s of a large matrix product",
+        ]
+        lines += [f"  {part:<28} {ms:8.1f} ms" for part, ms in result["milliseconds_by_part"].items()]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Read the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+    parser.add_argument("--out", type=Path, help="also write the JSON object to this file")
+    parser.add_argument("--player", choices=PLAYERS, help=argparse.SUPPRESS)
+    parser.add_argument("overrides", nargs="*", help="overrides of the training's config, such as sensor=full")
+    arguments = parser.parse_args()
+    if arguments.player is not None:
+        play(arguments.player, arguments.overrides)
+        return
+    from bench_common import report
+
+    results = {
+        name: compare([*overrides, *arguments.overrides], *counts) for name, (overrides, *counts) in BATCHES.items()
+    }
+    report(results["paper"] | {"laptop": results["laptop"]}, table(results), as_json=arguments.json, out=arguments.out)
+
+
+# ------------------------------------------------------------------------------------------------ a player
+def play(name: str, overrides: list[str]) -> None:
+    """Answer the parent's questions until it closes the pipe."""
+    row, is_product = PLAYERS[name]
+    if is_product:
+        runtime.keep_pages()
+    runtime.quiet_libraries()
+    import torch
+    from bench_common import gemm_peak, make_learner, seconds
+    from reference import ReferenceLearner
+
+    learner = make_learner(row, overrides)
+    if not is_product:
+        learner = ReferenceLearner(learner)
+    threads = runtime.set_threads(1 if "preset=laptop" in overrides else "auto")
+    facts = {
+        "sequences": learner.replay.batch_size,
+        "steps": learner.replay.sequence_slots - 1,
+        "threads": threads,
+        "allocator": runtime.allocator(),
+        "torch": torch.__version__,
+    }
+    answers: dict[str, Callable[[int], Any]] = {
+        "updates": lambda number: number * seconds(learner.update, number),
+        "peak": lambda _: gemm_peak(),
+        "flops": lambda _: count_flops(learner.update),
+        "parts": lambda number: time_parts(learner, number),
+        "facts": lambda _: facts,
+    }
+    for line in sys.stdin:
+        what, number = json.loads(line)
+        print(json.dumps(answers[what](number)), flush=True)
+
+
+def count_flops(call: Callable[[], Any]) -> int:
+    """Count the floating-point operations of all matrix products in a call; nothing element-wise counts."""
+    import torch
+    from torch.utils.flop_counter import FlopCounterMode
+
+    def addmm_(_: Any, a: Any, b: Any, **__: Any) -> int:
+        return 2 * a[0] * a[1] * b[1]
+
+    # The counter knows addmm, but not the form that adds in place.
+    with FlopCounterMode(display=False, custom_mapping={torch.ops.aten.addmm_: addmm_}) as counter:
+        call()
+    return counter.get_total_flops()
+
+
+def time_parts(learner: Any, updates: int) -> dict[str, float]:
+    """Return the milliseconds an update spends in every part, backward passes included.
+
+    A backward pass reaches all heads before the first encoder: the moment it reaches a memory divides it. The
+    learner is of no use for anything else afterwards.
+    """
+    spent: dict[str, float] = {}
+    marks: dict[str, float] = {}
+
+    def measure(owner: Any, name: str) -> None:
+        function = getattr(owner, name)
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*args, **kwargs)
+            marks[name] = time.perf_counter()
+            spent[name] = spent.get(name, 0.0) + marks[name] - start
+            if name == "_encode" and result.requires_grad:
+                result.register_hook(lambda _: marks.setdefault("memory", time.perf_counter()))
+            return result
+
+        object.__setattr__(owner, name, timed)
+
+    def optimise() -> None:
+        now, memory = time.perf_counter(), marks.pop("memory")
+        spent["backward to memories"] = spent.get("backward to memories", 0.0) + memory - marks["forward"]
+        spent["backward from memories"] = spent.get("backward from memories", 0.0) + now - memory
+        step()
+
+    for name in ("forward", "_encode", "_act", "_evaluate"):
+        measure(learner.loss, name)
+    measure(learner.replay, "sample")
+    measure(learner.targets, "step")
+    measure(learner.average, "update_parameters")
+    step = learner.optimizer.step
+    learner.optimizer.step = optimise
+    start = time.perf_counter()
+    for _ in range(updates):
+        learner.update()
+    total = time.perf_counter() - start
+    heads, encoders = spent["_act"] + spent["_evaluate"], spent["_encode"]
+    parts = {
+        "replay sampling": spent["sample"],
+        "encoders": encoders + spent["backward from memories"],
+        "heads and loss, backward": spent["backward to memories"],
+        "heads, forward": heads,
+        "loss, forward": spent["forward"] - heads - encoders,
+    }
+    # Relabelling takes a tenth of a millisecond, and is counted here.
+    parts["optimiser, targets, average"] = total - sum(parts.values())
+    return {part: 1e3 * value / updates for part, value in parts.items()}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+r"""The quantile critics' hot pieces on a CPU, each with its backward pass written out.
+
+They compute exactly what ordinary layers do (tests hold them against those, and against finite differences). A batch
+of 6,400 transitions has 100,000 quantiles: as ordinary layers, every gate, product and activation of theirs is 50
+MB that goes to main memory and back between two operations. Here rows go through all layers in blocks that stay in the
+cache; the products are torch's matrix products, and what lies between two of them is one compiled pass.
+
+Public names::
+
+    quantile_values(x [B,L,H], tau [B,L|1,N], beta [B,L|1,H], frequencies [C], gate, hidden, output) -> [B,L,N]
+    quantile_huber(quantiles [..,N], targets [..,N'], tau [..,N], kappa) -> [..]
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+# Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 256 kB.
+_ROWS_PER_BLOCK = 512
+
+
+# ------------------------------------------------------------------------------------------------ compiled passes
+@numba.njit(cache=True, error_model="numpy")
+def _multiply(x: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, product: np.ndarray) -> None:
+    """Write ``x * relu(tau_gate + beta)``, broadcast over steps and quantiles."""
+    zero = x.dtype.type(0)
+    for s in range(x.shape[0]):
+        for t in range(x.shape[1]):
+            features, offset = x[s, t], beta[s, min(t, beta.shape[1] - 1)]
+            gates = tau_gate[s, min(t, tau_gate.shape[1] - 1)]
+            for n in range(gates.shape[0]):
+                gate, out = gates[n], product[s, t, n]
+                for h in range(out.size):
+                    out[h] = features[h] * max(gate[h] + offset[h], zero)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _rectify(hidden: np.ndarray, bias: np.ndarray) -> None:
+    """Add the bias to every row and rectify, in place."""
+    zero = hidden.dtype.type(0)
+    for r in range(hidden.shape[0]):
+        row = hidden[r]
+        for h in range(row.size):
+            row[h] = max(row[h] + bias[h], zero)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _masked(out: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray) -> None:
+    """Write the output's gradient where hidden is active."""
+    zero = hidden.dtype.type(0)
+    for r in range(hidden.shape[0]):
+        row, d_row, slope = hidden[r], d_hidden[r], out[r]
+        for h in range(row.size):
+            d_row[h] = slope if row[h] > zero else zero
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _multiply_gradient(d_product: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, d_x: np.ndarray) -> None:
+    """Add the gradient of x: the product's, times the gate."""
+    zero = d_x.dtype.type(0)
+    for s in range(d_x.shape[0]):
+        for t in range(d_x.shape[1]):
+            d_features, offset = d_x[s, t], beta[s, min(t, beta.shape[1] - 1)]
+            gates = tau_gate[s, min(t, tau_gate.shape[1] - 1)]
+            for n in range(gates.shape[0]):
+                gate, d_out = gates[n], d_product[s, t, n]
+                for h in range(d_out.size):
+                    d_features[h] += d_out[h] * max(gate[h] + offset[h], zero)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _gate_gradient(
+    d_product: np.ndarray,
+    x: np.ndarray,
+    tau_gate: np.ndarray,
+    beta: np.ndarray,
+    d_tau_gate: np.ndarray,
+    d_beta: np.ndarray,
+) -> None:
+    """Add the gradients of both halves of the gate: the product's times x, where the gate is open."""
+    zero = x.dtype.type(0)
+    for s in range(x.shape[0]):
+        for t in range(x.shape[1]):
+            features, at_beta, at_tau = x[s, t], min(t, beta.shape[1] - 1), min(t, tau_gate.shape[1] - 1)
+            offset, d_offset = beta[s, at_beta], d_beta[s, at_beta]
+            for n in range(tau_gate.shape[2]):
+                gate, d_gate, d_out = tau_gate[s, at_tau, n], d_tau_gate[s, at_tau, n], d_product[s, t, n]
+                for h in range(d_out.size):
+                    change = d_out[h] * features[h] if gate[h] + offset[h] > zero else zero
+                    d_gate[h] += change
+                    d_offset[h] += change
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _huber(
+    quantiles: np.ndarray, targets: np.ndarray, tau: np.ndarray, kappa: float, errors: np.ndarray, slopes: np.ndarray
+) -> None:
+    """Add up each quantile's weighted Huber errors over the targets, and their slopes in it."""
+    one, half, zero, limit = tau.dtype.type(1), tau.dtype.type(0.5), tau.dtype.type(0), tau.dtype.type(kappa)
+    for r in range(quantiles.shape[0]):
+        quantile, fraction, error, slope = quantiles[r], tau[r], errors[r], slopes[r]
+        for j in range(targets.shape[1]):
+            target = targets[r, j]
+            for i in range(quantile.size):
+                delta = target - quantile[i]
+                clipped = min(max(delta, -limit), limit)
+                weighted = clipped * (fraction[i] if delta >= zero else one - fraction[i])
+                error[i] += weighted * (delta - half * clipped)
+                slope[i] -= weighted
+
+
+# ------------------------------------------------------------------------------------------------ quantile values
+class _QuantileValues(torch.autograd.Function):
+    """``output(relu(hidden(x * relu(gate(cos(frequencies * tau)) + beta))))``."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        tau: Tensor,
+        beta: Tensor,
+        frequencies: Tensor,
+        gate_weight: Tensor,
+        gate_bias: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        out_weight: Tensor,
+        out_bias: Tensor,
+    ) -> Tensor:
+        sequences, steps, number = x.shape[0], x.shape[1], tau.shape[-1]
+        result = x.new_empty(sequences, steps, number)
+        saved: list[Tensor] = []
+        for part in _blocks(sequences, steps * number):
+            cosines = torch.cos(tau[part].unsqueeze(-1) * frequencies).flatten(0, -2)
+            tau_gate = torch.addmm(gate_bias, cosines, gate_weight.t()).view(*tau[part].shape, -1)
+            product = _product(x[part], tau_gate, beta[part])
+            hidden = torch.mm(product, weight.t())
+            _rectify(hidden.numpy(), bias.numpy())
+            torch.addmv(out_bias, hidden, out_weight.view(-1), out=result[part].view(-1))
+            if any(ctx.needs_input_grad):
+                saved += [cosines, tau_gate, hidden]
+        ctx.save_for_backward(x, beta, gate_weight, weight, out_weight, *saved)
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        x, beta, gate_weight, weight, out_weight, *saved = ctx.saved_tensors
+        need_parameters = ctx.needs_input_grad[6]
+        d_x, d_beta = torch.zeros_like(x), torch.zeros_like(beta)
+        d_gate_weight, d_gate_bias = torch.zeros_like(gate_weight), x.new_zeros(gate_weight.shape[0])
+        d_weight, d_bias = torch.zeros_like(weight), x.new_zeros(weight.shape[0])
+        d_out_weight = x.new_zeros(weight.shape[0])
+        gradient = gradient.contiguous()
+        # The output layer's weight is the same for every row: it goes into the matrices instead of the rows.
+        slopes = out_weight.view(-1, 1)
+        through = weight * slopes
+        for index, part in enumerate(_blocks(gradient.shape[0], gradient[0].numel())):
+            cosines, tau_gate, hidden = saved[3 * index : 3 * index + 3]
+            out, d_hidden = gradient[part].view(-1), torch.empty_like(hidden)
+            _masked(out.numpy(), hidden.numpy(), d_hidden.numpy())
+            d_product = torch.mm(d_hidden, through).view(*gradient[part].shape, -1)
+            _multiply_gradient(d_product.numpy(), tau_gate.numpy(), beta[part].numpy(), d_x[part].numpy())
+            if need_parameters:
+                d_weight.addmm_(d_hidden.t(), _product(x[part], tau_gate, beta[part]))
+                d_bias += d_hidden.sum(0)
+                d_out_weight.addmv_(hidden.t(), out)
+                d_gate = torch.zeros_like(tau_gate)
+                gates = tau_gate.numpy(), beta[part].numpy(), d_gate.numpy(), d_beta[part].numpy()
+                _gate_gradient(d_product.numpy(), x[part].numpy(), *gates)
+                d_gate = d_gate.flatten(0, -2)
+                d_gate_weight.addmm_(d_gate.t(), cosines)
+                d_gate_bias += d_gate.sum(0)
+        if not need_parameters:
+            return (d_x, *[None] * 9)
+        d_weight, d_bias = d_weight.mul_(slopes), d_bias.mul_(slopes.view(-1))
+        d_output = d_out_weight.view_as(out_weight), gradient.sum().view(1)
+        return d_x, None, d_beta, None, d_gate_weight, d_gate_bias, d_weight, d_bias, *d_output
+
+
+def _blocks(sequences: int, rows: int) -> list[slice]:
+    """Cut the sequences of so many rows each into blocks."""
+    size = max(1, _ROWS_PER_BLOCK // rows)
+    return [slice(start, start + size) for start in range(0, sequences, size)]
+
+
+def _product(x: Tensor, tau_gate: Tensor, beta: Tensor) -> Tensor:
+    """Return ``x * relu(tau_gate + beta)``, a row a quantile."""
+    product = x.new_empty(x.shape[0], x.shape[1], *tau_gate.shape[2:])
+    _multiply(x.numpy(), tau_gate.numpy(), beta.numpy(), product.numpy())
+    return product.flatten(0, -2)
+
+
+def quantile_values(
+    x: Tensor, tau: Tensor, beta: Tensor, frequencies: Tensor, gate: nn.Linear, hidden: nn.Linear, output: nn.Linear
+) -> Tensor:
+    """Return ``output(relu(hidden(x * relu(gate(cos(frequencies * tau)) + beta))))``, ``[B, L, N]``.
+
+    Either all layers and ``beta`` take a gradient, or only ``x`` does.
+
+    Args:
+        x: features of a transition ``[B, L, H]``.
+        tau: fractions ``[B, L, N]``, or ``[B, 1, N]`` where constant along a sequence.
+        beta: its part of the gate before rectification, ``[B, L, H]`` or ``[B, 1, H]``.
+        frequencies: of the fractions' cosines ``[C]``.
+        gate: linear layer C to H.
+        hidden: linear layer H to H'.
+        output: linear layer H' to 1.
+    """
+    shape = x.shape[:2]
+    if tau.shape[1] == beta.shape[1] == shape[1]:
+        # Nothing is shared along a sequence: blocks need not hold whole ones.
+        x, tau, beta = (value.reshape(-1, 1, value.shape[-1]) for value in (x, tau, beta))
+    parameters = [p for layer in (gate, hidden, output) for p in (layer.weight, layer.bias)]
+    values = _QuantileValues.apply(x.contiguous(), tau, beta.contiguous(), frequencies, *parameters)
+    return values.view(*shape, -1)
+
+
+# ------------------------------------------------------------------------------------------------ quantile Huber
+class _QuantileHuber(torch.autograd.Function):
+    """Each quantile's error, the mean over the targets; forward already knows the slope."""
+
+    @staticmethod
+    def forward(ctx: Any, quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float) -> Tensor:
+        errors, slopes = torch.zeros_like(quantiles), torch.zeros_like(quantiles)
+        _huber(quantiles.numpy(), targets.numpy(), tau.numpy(), kappa, errors.numpy(), slopes.numpy())
+        share = 1.0 / (kappa * targets.shape[1])
+        ctx.save_for_backward(slopes.mul_(share))
+        return errors.sum(-1).mul_(share)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        (slopes,) = ctx.saved_tensors
+        return slopes * gradient.unsqueeze(-1), None, None, None
+
+
+def quantile_huber(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float) -> Tensor:
+    """Return the quantile Huber loss ``[..]``; see :func:`rcdsac_trl.agent.functional.quantile_huber_loss`.
+
+    Args:
+        quantiles: predictions ``[.., N]``.
+        targets: target samples ``[.., N']``; no gradient flows to them.
+        tau: fractions ``[.., N]`` of the predictions.
+        kappa: where the loss turns from quadratic to linear.
+    """
+    lead = torch.broadcast_shapes(quantiles.shape[:-1], targets.shape[:-1], tau.shape[:-1])
+    rows = [
+        value.expand(*lead, value.shape[-1]).reshape(-1, value.shape[-1]).to(quantiles.dtype).contiguous()
+        for value in (quantiles, targets.detach(), tau)
+    ]
+    return _QuantileHuber.apply(*rows, kappa).view(lead)
