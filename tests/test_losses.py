@@ -281,6 +281,19 @@ def _fractions_of_the_prediction() -> Tensor:
     return torch.rand((2, 1, 3), generator=g)
 
 
+@pytest.mark.parametrize("per", ["sequence", "transition"])
+def test_one_beta_expanded_is_the_same_as_repeated(per: str) -> None:
+    repeated = make_batch(beta=-1.5)
+    expanded = repeated.clone()
+    expanded["risk"] = repeated["risk"][:, :1].expand(-1, repeated.shape[1], -1)
+    assert expanded["risk"].stride(1) == 0 != repeated["risk"].stride(1)
+    loss = make_loss(fractions_per=per, reduction="none")
+    shared = loss(expanded)
+    loss.rng_state = torch.Generator().manual_seed(3).get_state()
+    for key, value in loss(repeated).items():
+        torch.testing.assert_close(shared[key], value)
+
+
 # ------------------------------------------------------------------------------------------------ structure
 @pytest.mark.parametrize("kind", ["rcdsac", "dsac", "sac"])
 @pytest.mark.parametrize("number", [1, 2])

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-# Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 256 kB.
-_ROWS_PER_BLOCK = 512
+# Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
+_ROWS_PER_BLOCK = 1024
 
 
 # ------------------------------------------------------------------------------------------------ compiled passes

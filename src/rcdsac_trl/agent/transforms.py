@@ -135,7 +135,8 @@ class Relabel:
         """Set `risk` ``[B, L + 1, 1]``."""
         sequences, slots = batch.shape
         if self.mode == "fixed" and self.beta is not None:
-            return batch.set("risk", torch.full((sequences, slots, 1), self.beta, device=batch.device))
+            one = torch.full((1, 1, 1), self.beta, device=batch.device)
+            return batch.set("risk", one.expand(sequences, slots, 1))
         if self.mode == "resample" and self.generator is not None:
             drawn = self.measure.sample((sequences, slots if self.per == "transition" else 1, 1), self.generator)
             return batch.set("risk", drawn.expand(sequences, slots, 1))

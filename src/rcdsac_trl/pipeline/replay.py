@@ -209,7 +209,9 @@ class SequenceReplay:
         slots = flat.reshape(self.batch_size, self.sequence_slots)
         weight = slots["collision_weight"] if "collision_weight" in self.context_keys else 1.0
         reward = slots["reward_rest"] + weight * slots["reward_collision"]
-        kept = {key: slots[key] for key in ("waypoint", "velocity", "action", *self.context_keys)}
+        kept = {key: slots[key] for key in ("waypoint", "velocity", "action")}
+        # One value expanded: the loss then knows that a sequence shares it.
+        kept |= {key: slots[key][:, :1].expand(-1, self.sequence_slots, -1) for key in self.context_keys}
         return TensorDict(
             {
                 **kept,

@@ -6,6 +6,7 @@ This module is imported before torch, so that a re-executed process has paid not
 import os
 import re
 import sys
+from contextlib import suppress
 
 from rcdsac_trl.errors import UserInputError
 
@@ -18,16 +19,25 @@ _GLIBC_KEEPS_PAGES = {
 
 
 def keep_pages() -> None:
-    """Start this process again with an allocator that keeps its pages, once, on Linux.
+    """Start this process again with an allocator that keeps its pages, once, where the C library is glibc.
 
     The settings only work from a process's first moment. A user who has set one of them, or preloads another
-    allocator, is left alone; C libraries other than glibc ignore them.
+    allocator, is left alone. Where the process cannot be started again it goes on as it is.
     """
-    if sys.platform != "linux" or "LD_PRELOAD" in os.environ:
+    if not _has_glibc() or "LD_PRELOAD" in os.environ or not sys.executable:
         return
     if any(name in os.environ for name in _GLIBC_KEEPS_PAGES):
         return
-    os.execve(sys.executable, sys.orig_argv, os.environ | _GLIBC_KEEPS_PAGES)
+    with suppress(OSError):
+        os.execve(sys.executable, sys.orig_argv, os.environ | _GLIBC_KEEPS_PAGES)
+
+
+def _has_glibc() -> bool:
+    """Return whether the C library is glibc: no other knows its version's name."""
+    try:
+        return bool(os.confstr("CS_GNU_LIBC_VERSION"))
+    except (AttributeError, OSError, ValueError):
+        return False
 
 
 def quiet_libraries() -> None:
@@ -39,8 +49,12 @@ def allocator() -> str:
     """Name the allocator's state for the log."""
     if "LD_PRELOAD" in os.environ:
         return f"preloaded ({os.environ['LD_PRELOAD']})"
-    kept = all(os.environ.get(name) == value for name, value in _GLIBC_KEEPS_PAGES.items())
-    return "glibc that keeps its pages" if kept else "the system's default"
+    given = {name: os.environ[name] for name in _GLIBC_KEEPS_PAGES if name in os.environ}
+    if not given or not _has_glibc():
+        return "the system's default"
+    if given == _GLIBC_KEEPS_PAGES:
+        return "glibc that keeps its pages"
+    return f"glibc with {', '.join(f'{name}={value}' for name, value in given.items())}"
 
 
 def resolve_device(name: str) -> str:
