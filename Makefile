@@ -5,7 +5,10 @@ BIN := $(VENV)/bin
 # Torch goes first: what depends on it would otherwise pick a version, and a build, of its own.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: setup train smoke test test-slow check format clean
+# Programs of benchmarks/, in the order they run.
+BENCHMARKS := learner
+
+.PHONY: setup train smoke test test-slow check format bench clean
 
 train: setup
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
@@ -18,6 +21,9 @@ test: setup
 
 test-slow: setup
 	$(BIN)/python -m pytest -m "slow or not slow"
+
+bench: setup
+	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 check: setup
 	$(BIN)/ruff check .
