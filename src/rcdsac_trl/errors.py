@@ -1,4 +1,4 @@
-"""The one exception for wrong input: its message is the sentence a user reads."""
+"""The exceptions whose message is the sentence a user reads: wrong input, and a training that cannot go on."""
 
 
 class UserInputError(ValueError):
@@ -6,4 +6,11 @@ class UserInputError(ValueError):
 
     The message is one sentence that names the value, the limit and the remedy. Entry points print it and
     exit with code 2, before work starts and before anything is written.
+    """
+
+
+class TrainingError(RuntimeError):
+    """A training that cannot go on, through no fault of the input.
+
+    The message is one sentence that says what happened and where to look. Entry points print it and exit with code 1.
     """

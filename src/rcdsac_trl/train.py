@@ -1,4 +1,4 @@
-"""Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``."""
+"""Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``; go on: ``.. resume=runs/<folder>``."""
 
 from pathlib import Path
 
@@ -21,7 +21,22 @@ def check_folder(folder: Path) -> None:
     logs.check_folder(folder)
 
 
-@entry_point("train", check=check, check_folder=check_folder)
+def continue_run(overrides: list[str], multirun: bool) -> bool:
+    """Continue the run that `resume` means; return whether there was one. Hydra, which makes folders, has no part."""
+    from rcdsac_trl.pipeline import build
+
+    folder = build.run_to_continue(overrides, multirun=multirun)
+    if folder is None:
+        return False
+    trainer = build.resumed(folder)
+    if trainer is None:
+        print(f"{folder} is finished: nothing is left to do")
+    else:
+        trainer.run()
+    return True
+
+
+@entry_point("train", check=check, check_folder=check_folder, instead=continue_run)
 def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
     from rcdsac_trl.pipeline import build

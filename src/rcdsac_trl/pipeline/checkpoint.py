@@ -1,4 +1,9 @@
-"""Checkpoints of a run: ``last`` (the newest) and ``best`` (the highest validation score)."""
+"""Checkpoints of a run: one folder each, which never changes once it has its name.
+
+``checkpoints/iteration-000012`` is the whole state after 12 iterations: :mod:`torchrl.checkpoint` writes the
+components, :mod:`rcdsac_trl.pipeline.saved` the record around them, and :mod:`rcdsac_trl.pipeline.durable` sees to it
+that the folder is whole or absent.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,60 +11,126 @@ from typing import Any
 
 import torch
 from torch.optim.swa_utils import AveragedModel
-from torchrl.checkpoint import Checkpoint
+from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 from torchrl.objectives import LossModule
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline import durable
+from rcdsac_trl.pipeline.replay_files import ReplayFiles
+from rcdsac_trl.pipeline.saved import Name, Progress, Saved, find, folder_name, folders, record_or_none, write_record
+
+
+class Generators:
+    """Named random generators as one component with a ``state_dict``."""
+
+    def __init__(self, **generators: torch.Generator) -> None:
+        self._generators = generators
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return the state of each."""
+        return {name: generator.get_state() for name, generator in self._generators.items()}
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Set the state of each."""
+        for name, generator in self._generators.items():
+            generator.set_state(state[name])
 
 
 class Checkpoints:
-    """Saves a loss (all weights, targets and temperature), the averaged actor and the optimiser.
-
-    Built on :mod:`torchrl.checkpoint`.
+    """Saves and restores the components of a run.
 
     Args:
-        folder: where ``last`` and ``best`` go.
-        loss: the loss module; holds every weight that is learnt.
-        average: the running average of its actor.
-        optimizer: its optimiser.
+        folder: where checkpoints go.
+        components: what is saved, by name; each has ``state_dict`` and ``load_state_dict``.
+        replay: the files of the replay, which checkpoints name; None: the replay is not saved.
+        keep: how many of the newest checkpoints stay; the best one they name stays as well.
+
+    Attributes:
+        saved_iterations: iterations done at the last checkpoint that was saved or restored; None before.
     """
 
-    def __init__(
-        self, folder: Path, loss: LossModule, average: AveragedModel, optimizer: torch.optim.Optimizer
-    ) -> None:
+    def __init__(self, folder: Path, components: Mapping[str, Any], *, replay: ReplayFiles | None, keep: int) -> None:
         self.folder = folder
-        self._checkpoint = Checkpoint(loss=loss, average=average, optimizer=optimizer)
+        self.replay = replay
+        self.keep = keep
+        self.saved_iterations: int | None = None
+        self._checkpoint = Checkpoint()
+        for name, component in components.items():
+            # One file for all tensors of a component: a checkpoint is soon on the disk, and soon hashed.
+            self._checkpoint.register(name, component, adapter=StateDictCheckpointAdapter("consolidated"))
 
-    def save(self, name: str, progress: Mapping[str, Any]) -> Path:
-        """Write a checkpoint; `progress` is kept in its manifest."""
-        return self._checkpoint.save(self.folder / name, metadata=dict(progress))
+    def save(self, progress: Progress, logs: Mapping[str, int]) -> Path:
+        """Save everything, remove what is then too old, and return the checkpoint's folder.
 
+        Args:
+            progress: of the run.
+            logs: length of every log file, which must be on the disk up to there.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        durable.clear_leftovers(self.folder)
+        segments = [] if self.replay is None else self.replay.save()
+        path = self.folder / folder_name(progress.iterations)
+        temporary = durable.unfinished(path)
+        self._checkpoint.save(temporary)
+        write_record(temporary, progress, segments, logs)
+        durable.publish(path)
+        self.saved_iterations = progress.iterations
+        self._rotate()
+        return path
 
-def load_manifest(folder: Path, name: str) -> dict[str, Any]:
-    """Read what was saved with a checkpoint, without its weights.
+    def restore(self, saved: Saved) -> None:
+        """Load a checkpoint that is whole, and forget everything that was saved after it.
 
-    Raises:
-        UserInputError: if there is no such checkpoint.
-    """
-    path = folder / name
-    if not Checkpoint.is_checkpoint(path):
-        raise UserInputError(f"there is no checkpoint {path}: has this run saved one yet?")
-    return dict(Checkpoint.manifest(path)["metadata"])
+        Raises:
+            UserInputError: if it is of another shape.
+        """
+        _load(self._checkpoint, saved.path)
+        for path in folders(self.folder):
+            if path.name > saved.path.name:
+                durable.remove_folder(path)
+        durable.clear_leftovers(self.folder)
+        if self.replay is not None:
+            self.replay.load(saved.segments)
+            self.replay.remove_others({segment.file for segment in saved.segments} | self._named_segments())
+        self.saved_iterations = saved.progress.iterations
+
+    def _rotate(self) -> None:
+        newest = folders(self.folder)[-self.keep :]
+        records = [record for path in newest if (record := record_or_none(path)) is not None]
+        best = {record.progress.best_iterations for record in records}
+        kept = {path.name for path in newest} | {folder_name(number) for number in best if number is not None}
+        for path in folders(self.folder):
+            if path.name not in kept:
+                durable.remove_folder(path)
+        if self.replay is not None:
+            self.replay.remove_others(self._named_segments())
+
+    def _named_segments(self) -> set[str]:
+        """Name the files of the replay that one needs to continue from a checkpoint that stays."""
+        records = [record_or_none(path) for path in folders(self.folder)[-self.keep :]]
+        return {segment.file for record in records if record is not None for segment in record.segments}
 
 
 def load_weights(
-    folder: Path, name: str, *, loss: LossModule | None = None, average: AveragedModel | None = None
-) -> dict[str, Any]:
+    folder: Path, name: Name, *, loss: LossModule | None = None, average: AveragedModel | None = None
+) -> list[str]:
     """Load the weights of a checkpoint into a loss, an averaged actor, or both, of the same shape.
 
     Returns:
-        The progress that was saved with them.
+        One sentence for each damaged checkpoint that was passed over.
 
     Raises:
-        UserInputError: if there is no such checkpoint.
+        UserInputError: as :func:`find`, or if the checkpoint is of another shape.
     """
-    progress = load_manifest(folder, name)
+    saved, damaged = find(folder, name)
     wanted = {"loss": loss, "average": average}
-    components = {key: module for key, module in wanted.items() if module is not None}
-    Checkpoint(**components).load(folder / name, components=list(components))
-    return progress
+    _load(Checkpoint(**{key: module for key, module in wanted.items() if module is not None}), saved.path)
+    return damaged
+
+
+def _load(checkpoint: Checkpoint, path: Path) -> None:
+    try:
+        checkpoint.load(path, map_location="cpu")
+    except CheckpointError as error:
+        reason = " ".join(str(error).split())
+        raise UserInputError(f"checkpoint {path} does not fit this version ({reason}): use the one it is of") from error

@@ -2,6 +2,7 @@
 
 import re
 import sys
+from argparse import Namespace
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import wraps
@@ -17,7 +18,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.errors import TrainingError, UserInputError
 from rcdsac_trl.paths import CONF_DIR
 from rcdsac_trl.pipeline.runtime import keep_pages, quiet_libraries
 from rcdsac_trl.pipeline.typed import unknown_key
@@ -29,7 +30,11 @@ INTERRUPTED = 130
 
 
 def entry_point(
-    config_name: str, *, check: Task, check_folder: Callable[[Path], None] | None = None
+    config_name: str,
+    *,
+    check: Task,
+    check_folder: Callable[[Path], None] | None = None,
+    instead: Callable[[list[str], bool], bool] | None = None,
 ) -> Callable[[Task], Callable[[], None]]:
     """Make a Hydra main of a task.
 
@@ -38,6 +43,8 @@ def entry_point(
         check: called with the composed config before Hydra creates a folder; raises
             :class:`~rcdsac_trl.errors.UserInputError` for what cannot work.
         check_folder: called likewise with the folder that Hydra is about to write into.
+        instead: called first, with the overrides and whether there are several jobs; returns whether it did what the
+            call asks for, so that Hydra has nothing to start.
     """
 
     def decorate(task: Task) -> Callable[[], None]:
@@ -46,16 +53,19 @@ def entry_point(
             try:
                 check(cfg)
                 task(cfg)
-            except UserInputError as error:
+            except (UserInputError, TrainingError) as error:
                 fail(error)
 
         def main() -> None:
             keep_pages()
             quiet_libraries()
             try:
+                asked = read_arguments(sys.argv[1:])
+                if instead is not None and asked is not None and instead(asked.overrides, asked.multirun):
+                    return
                 precheck(config_name, sys.argv[1:], check, check_folder)
                 hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
-            except UserInputError as error:
+            except (UserInputError, TrainingError) as error:
                 fail(error)
             except KeyboardInterrupt:
                 print("rcdsac_trl: interrupted", file=sys.stderr)
@@ -66,10 +76,22 @@ def entry_point(
     return decorate
 
 
-def fail(error: UserInputError) -> NoReturn:
-    """Print the sentence and leave with code 2."""
+def fail(error: UserInputError | TrainingError) -> NoReturn:
+    """Print the sentence and leave with code 2 for wrong input, else with 1."""
     print(f"rcdsac_trl: {error}", file=sys.stderr)
-    raise SystemExit(2)
+    raise SystemExit(2 if isinstance(error, UserInputError) else 1)
+
+
+def read_arguments(argv: list[str]) -> Namespace | None:
+    """Read Hydra's arguments (`overrides`, `multirun`, ..); None if they only show something (``--help``, ``--cfg``).
+
+    Raises:
+        UserInputError: for an option that does not exist.
+    """
+    args, unknown = get_args_parser().parse_known_args(argv)
+    if unknown:
+        raise UserInputError(f"there is no option {unknown[0]}: --help lists them")
+    return None if args.help or args.hydra_help or args.cfg or args.info else args
 
 
 def precheck(
@@ -79,15 +101,18 @@ def precheck(
 
     Calls that only show something (``--help``, ``--cfg``, ..) are left to Hydra.
     """
-    args, unknown = get_args_parser().parse_known_args(argv)
-    if unknown:
-        raise UserInputError(f"there is no option {unknown[0]}: --help lists them")
-    if args.help or args.hydra_help or args.cfg or args.info:
+    args = read_arguments(argv)
+    if args is None:
         return
     for overrides in _jobs(args.overrides) if args.multirun else [args.overrides]:
         check(compose(config_name, overrides))
     if check_folder is not None and not args.multirun:
-        check_folder(Path(_compose(config_name, args.overrides, return_hydra_config=True).hydra.run.dir))
+        check_folder(output_folder(config_name, args.overrides))
+
+
+def output_folder(config_name: str, overrides: list[str]) -> Path:
+    """Return the folder that Hydra would write into."""
+    return Path(_compose(config_name, overrides, return_hydra_config=True).hydra.run.dir)
 
 
 def _jobs(overrides: list[str]) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -11,11 +12,14 @@ from pathlib import Path
 
 import pandas as pd
 from omegaconf import DictConfig, OmegaConf
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from torchrl.record.loggers import Logger
+from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.record.loggers.utils import get_logger
 from tqdm import tqdm
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.metrics import METRICS, Condition
 
 CONFIG_NAME = "config.yaml"
@@ -67,7 +71,6 @@ def start_run_folder(folder: Path, cfg: DictConfig, facts: Mapping[str, object])
     """
     check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(cfg, folder / CONFIG_NAME, resolve=True)
     manifest = {
         "command": [Path(sys.argv[0]).stem, *sys.argv[1:]],
         "seed": cfg.seed,
@@ -77,7 +80,42 @@ def start_run_folder(folder: Path, cfg: DictConfig, facts: Mapping[str, object])
         "packages": {name: version(name) for name in _PACKAGES},
         **facts,
     }
-    (folder / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
+    durable.write(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
+    # Last: a folder that has a config is a run.
+    durable.write(folder / CONFIG_NAME, OmegaConf.to_yaml(cfg, resolve=True).encode())
+
+
+def lengths(folder: Path) -> dict[str, int]:
+    """Bring the tables and the CSV scalars of a run to the disk and return how long each file is, in bytes."""
+    files = _tables(folder)
+    for path in files:
+        durable.sync(path)
+    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+
+
+def cut(folder: Path, recorded: Mapping[str, int]) -> list[str]:
+    """Shorten the tables and the CSV scalars of a run to what they were when :func:`lengths` was called.
+
+    Returns:
+        One sentence for each file that is shorter than that.
+    """
+    for path in _tables(folder):
+        length = recorded.get(path.relative_to(folder).as_posix(), 0)
+        if length == 0:
+            path.unlink()
+        elif path.stat().st_size > length:
+            os.truncate(path, length)
+            durable.sync(path)
+    found = {name: (folder / name).stat().st_size if (folder / name).exists() else 0 for name in recorded}
+    return [
+        f"{folder / name} has lost rows: it holds {found[name]} bytes of {length}"
+        for name, length in recorded.items()
+        if found[name] < length
+    ]
+
+
+def _tables(folder: Path) -> list[Path]:
+    return sorted([*folder.glob("*_episodes.csv"), *folder.glob("csv/scalars/**/*.csv")])
 
 
 class RunLog:
@@ -86,14 +124,19 @@ class RunLog:
     Args:
         folder: the run folder.
         backends: TorchRL loggers, checked by :func:`check_backends`.
+        continued_at: agent steps at which a run is continued: TensorBoard then forgets what was logged after them.
     """
 
-    def __init__(self, folder: Path, backends: Sequence[str]) -> None:
+    def __init__(self, folder: Path, backends: Sequence[str], *, continued_at: int | None = None) -> None:
         self.folder = folder
         self._loggers: list[Logger] = [
             get_logger(name, logger_name=str(folder), experiment_name=name) for name in backends
         ]
         self._file = (folder / "train.log").open("a", buffering=1)
+        for logger in self._loggers:
+            if isinstance(logger, TensorboardLogger) and continued_at is not None:
+                start = SessionLog(status=SessionLog.START)
+                logger.experiment.file_writer.add_event(Event(step=continued_at + 1, session_log=start))
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Log scalars at an agent step."""
@@ -105,6 +148,13 @@ class RunLog:
         """Append one row an episode to ``<name>_episodes.csv``."""
         path = self.folder / f"{name}_episodes.csv"
         rows.to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.6g")
+
+    def lengths(self) -> dict[str, int]:
+        """Bring everything to the disk; see :func:`lengths`."""
+        for logger in self._loggers:
+            if isinstance(logger, TensorboardLogger):
+                logger.experiment.flush()
+        return lengths(self.folder)
 
     def message(self, text: str) -> None:
         """Say something on the console (without breaking the progress bar) and in ``train.log``."""

@@ -5,6 +5,7 @@ Every observation is stored once. An episode of T transitions takes T + 1 slots 
 action and reward are padding that no sequence uses.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -160,11 +161,13 @@ class SequenceReplay:
         self.device = torch.device(device)
         episode_slots = episode_steps + 1
         self.capacity_episodes = capacity_steps // episode_steps
+        self.episodes_added = 0
+        self.generator = torch_stream(seed, "replay")
         self.buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(self.capacity_episodes * episode_slots),
             sampler=SequenceSampler(episode_slots, self.sequence_slots),
             batch_size=batch_size * self.sequence_slots,
-            generator=torch_stream(seed, "replay"),
+            generator=self.generator,
         )
 
     def __len__(self) -> int:
@@ -193,8 +196,48 @@ class SequenceReplay:
             slots[key] = torch.cat([value, torch.zeros_like(value[:, :1])], 1)
         for key in self.context_keys:
             slots[key] = torch.cat([episodes[key], episodes[key][:, -1:]], 1)
-        num_slots = episodes.shape[0] * (self.episode_steps + 1)
-        self.buffer.extend(TensorDict({k: v.flatten(0, 1) for k, v in slots.items()}, batch_size=[num_slots]))
+        self._extend(TensorDict(slots, batch_size=slots["action"].shape[:2]))
+
+    def _extend(self, slots: TensorDict) -> None:
+        self.buffer.extend(slots.flatten(0, 1))
+        self.episodes_added += slots.shape[0]
+
+    @property
+    def oldest_episode(self) -> int:
+        """Number of the oldest episode held; episodes count from 0 in the order in which they were added."""
+        return max(0, self.episodes_added - self.capacity_episodes)
+
+    def stored_episodes(self, first: int, number: int) -> TensorDict:
+        """Return episodes as they are stored.
+
+        Args:
+            first: number of the first one, see :attr:`oldest_episode`.
+            number: how many.
+
+        Returns:
+            TensorDict ``[number, T + 1]`` with the keys of :func:`slot_spec`.
+        """
+        if first < self.oldest_episode or first + number > self.episodes_added:
+            raise ValueError(f"episodes {first} to {first + number - 1} are not all in the replay")
+        episode = torch.arange(first, first + number) % self.capacity_episodes
+        episode_slots = self.episode_steps + 1
+        index = episode.unsqueeze(-1) * episode_slots + torch.arange(episode_slots)
+        return self.buffer.storage[index.flatten()].exclude("index").reshape(number, episode_slots)
+
+    def restore(self, first: int, parts: Iterable[TensorDict]) -> None:
+        """Fill an empty replay with what :meth:`stored_episodes` returned, each episode where it was.
+
+        Args:
+            first: number of the first episode.
+            parts: ``[N, T + 1]`` each, episode after episode.
+        """
+        if self.episodes_added:
+            raise ValueError("only an empty replay can be restored")
+        self.episodes_added = first
+        slot = first % self.capacity_episodes * (self.episode_steps + 1)
+        self.buffer.writer.load_state_dict({"_cursor": slot})
+        for part in parts:
+            self._extend(part)
 
     def sample(self) -> TensorDict:
         """Return a batch of sequences.

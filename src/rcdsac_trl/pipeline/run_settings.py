@@ -66,13 +66,15 @@ class ValidationSettings:
 
 @dataclass(frozen=True)
 class CheckpointSettings:
-    """When training saves its agent."""
+    """When training saves everything, and how much of that stays."""
 
     every_iterations: int
+    keep: int
 
     def __post_init__(self) -> None:
         """Refuse what is below 1."""
         _check_least("checkpoint.every_iterations", self.every_iterations, 1)
+        _check_least("checkpoint.keep", self.keep, 1)
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class TrainingSettings:
     map: MapSettings
     task: TaskSettings
     logger: LoggerSettings
+    resume: str | None
     seed: int
     device: str
     threads: Threads

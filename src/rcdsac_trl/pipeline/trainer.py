@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from dataclasses import replace
 
 import pandas as pd
 import torch
@@ -14,11 +14,15 @@ from torchrl.collectors import Collector
 from torchrl.objectives import LossModule, SoftUpdate
 from tqdm import tqdm
 
+from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
+from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.evaluation import Validation
+from rcdsac_trl.pipeline.guard import FiniteGuard
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics, validation_score
 from rcdsac_trl.pipeline.replay import SequenceReplay
+from rcdsac_trl.pipeline.saved import Progress
 from rcdsac_trl.pipeline.settings import Schedule
 
 LOSS_KEYS = ("loss_qvalue", "loss_actor", "loss_alpha")
@@ -96,18 +100,21 @@ class Learner:
 
 
 class Trainer:
-    """Runs a :class:`Schedule`.
+    """Runs a :class:`Schedule`, from its first iteration or from where a run was left.
 
     Args:
         schedule: the layout of the run.
-        collector: yields the episodes of one iteration, ``[..., T]``.
+        progress: what is done already.
+        collector: yields the episodes of one iteration, ``[..., T]``, from the next iteration on.
         set_iteration: told the iteration whose episodes are about to be collected.
         learner: does the updates.
+        guard: looks for NaN and infinity.
         validate: returns one row an episode on validation maps; closed at the end, as the collector is.
         validate_every: iterations between validations.
-        checkpoints: where the agent is saved.
+        checkpoints: where everything is saved.
         checkpoint_every: iterations between checkpoints.
         log: where everything is written.
+        lock: keeps others out of the folder; let go at the end.
         context_key: what tells episodes apart in the log: ``"risk"``, ``"collision_weight"`` or None.
     """
 
@@ -115,52 +122,73 @@ class Trainer:
         self,
         *,
         schedule: Schedule,
+        progress: Progress,
         collector: Collector,
         set_iteration: Callable[[int], None],
         learner: Learner,
+        guard: FiniteGuard,
         validate: Validation,
         validate_every: int,
         checkpoints: Checkpoints,
         checkpoint_every: int,
         log: RunLog,
+        lock: FolderLock,
         context_key: str | None,
     ) -> None:
         self.schedule = schedule
+        self.progress = progress
         self.collector = collector
         self.set_iteration = set_iteration
         self.learner = learner
+        self.guard = guard
         self.validate = validate
         self.validate_every = validate_every
         self.checkpoints = checkpoints
         self.checkpoint_every = checkpoint_every
         self.log = log
+        self.lock = lock
         self.context_key = context_key
-        self.steps = 0
-        self.updates = 0
-        self.best_score = float("-inf")
 
     def run(self) -> None:
-        """Train to the end of the schedule; Ctrl-C ends it early, with a checkpoint."""
-        self.log.message(f"{self.schedule.iterations} iterations; write to {self.log.folder}")
-        started = time.monotonic()
+        """Train to the end of the schedule; what is done after the last checkpoint is lost if it ends early.
+
+        Raises:
+            TrainingError: if a number is NaN or infinite.
+        """
+        try:
+            self._run()
+        except KeyboardInterrupt:
+            self.log.message(
+                f"interrupted in iteration {self.progress.iterations}; "
+                f"{self.checkpoints.saved_iterations or 0} are saved, resume={self.log.folder} continues there"
+            )
+            raise
+        except TrainingError as error:
+            self.log.message(str(error))
+            raise
+        finally:
+            # A shell's Ctrl-C may have ended the workers already: closing must not hide why training ends.
+            self.collector.shutdown(raise_on_error=False)
+            self.validate.close()
+            self.log.close()
+            self.lock.close()
+
+    def _run(self) -> None:
+        total = self.schedule.iterations
+        self.log.message(f"{total} iterations; write to {self.log.folder}")
+        if self.checkpoints.saved_iterations is None:
+            self._save()  # so that whatever is in the folder later can be told from what was never saved
+        started = time.monotonic() - self.progress.elapsed_s
         episodes = self._episodes()
-        iteration = 0
-        with tqdm(total=self.schedule.iterations, unit="it", disable=None, smoothing=0.1) as bar:
-            try:
-                for iteration in range(self.schedule.iterations):
-                    record = self._iterate(iteration, episodes)
-                    record["time/elapsed_s"] = time.monotonic() - started
-                    self.log.scalars(record, self.steps)
-                    self.log.progress(iteration, self.schedule.iterations, self.updates, record, bar)
-            except KeyboardInterrupt:
-                self.log.message(f"interrupted in iteration {iteration}: save and stop")
-                self._save(iteration)
-                raise
-            finally:
-                # A shell's Ctrl-C may have ended the workers already: closing must not hide why training ends.
-                self.collector.shutdown(raise_on_error=False)
-                self.validate.close()
-                self.log.close()
+        with tqdm(total=total, initial=self.progress.iterations, unit="it", disable=None, smoothing=0.1) as bar:
+            for iteration in range(self.progress.iterations, total):
+                record = self._iterate(iteration, episodes)
+                record["time/elapsed_s"] = time.monotonic() - started
+                self.progress = replace(self.progress, iterations=iteration + 1, elapsed_s=record["time/elapsed_s"])
+                self.log.scalars(record, self.progress.steps)
+                self.log.progress(iteration, total, self.progress.updates, record, bar)
+                if self._is_due(iteration, self.checkpoint_every) or self.progress.best_iterations == iteration + 1:
+                    self._save()
 
     def _episodes(self) -> Iterator[TensorDictBase]:
         for batch in self.collector:
@@ -168,33 +196,38 @@ class Trainer:
 
     def _iterate(self, iteration: int, episodes: Iterator[TensorDictBase]) -> dict[str, float]:
         self.set_iteration(iteration)
+        self.guard.start_iteration(iteration)
         strength = self.schedule.distortion_strength(iteration)
         share = self.schedule.learning_rate_share(iteration)
         t0 = time.monotonic()
         batch = next(episodes)
         t1 = time.monotonic()
+        self.guard.check_episodes(batch)
         self.learner.replay.add_episodes(batch)
-        self.steps += batch.numel()
+        self.progress = replace(self.progress, steps=self.progress.steps + batch.numel())
         # Before the updates: episodes are logged under the number of updates that they were driven with.
         record = self._training_record(iteration, batch)
         t2 = time.monotonic()
-        diagnostics = self.learner.updates(self.schedule.updates_per_iteration, strength, share)
-        self.updates += self.schedule.updates_per_iteration
+        number = self.schedule.updates_per_iteration
+        diagnostics = self.learner.updates(number, strength, share)
+        self.guard.end_iteration()
+        self.progress = replace(self.progress, updates=self.progress.updates + number)
         t3 = time.monotonic()
         record |= {f"learn/{key}": value for key, value in diagnostics.items()}
         record |= {
             "learn/distortion_strength": strength,
             "learn/learning_rate_share": share,
-            "learn/updates": float(self.updates),
+            "learn/updates": float(self.progress.updates),
             "time/steps_per_s": batch.numel() / (t1 - t0),
-            "time/updates_per_s": self.schedule.updates_per_iteration / max(t3 - t2, 1e-9),
+            "time/updates_per_s": number / max(t3 - t2, 1e-9),
         }
-        last = iteration + 1 == self.schedule.iterations
-        if last or (iteration + 1) % self.validate_every == 0:
+        if self._is_due(iteration, self.validate_every):
             record |= self._validate(iteration)
-        if last or (iteration + 1) % self.checkpoint_every == 0:
-            self._save(iteration)
         return record
+
+    def _is_due(self, iteration: int, every: int) -> bool:
+        """Say whether what is done every so many iterations, and after the last one, is done after this one."""
+        return iteration + 1 == self.schedule.iterations or (iteration + 1) % every == 0
 
     def _training_record(self, iteration: int, batch: TensorDictBase) -> dict[str, float]:
         metrics = episode_metrics(batch)
@@ -211,33 +244,27 @@ class Trainer:
                     record |= {f"train/{metric}/{half}_{told}": float(part[metric].mean()) for metric in METRICS}
         rows.insert(0, "episode", range(len(rows)))
         rows.insert(0, "iteration", iteration)
-        rows.insert(1, "updates", self.updates)
+        rows.insert(1, "updates", self.progress.updates)
         self.log.episodes("training", rows)
         return record
 
     def _validate(self, iteration: int) -> dict[str, float]:
         rows = self.validate()
         rows.insert(0, "iteration", iteration)
-        rows.insert(1, "updates", self.updates)
+        rows.insert(1, "updates", self.progress.updates)
         self.log.episodes("validation", rows)
         conditions = ["beta", "collision_weight"]
         by_condition = rows.groupby(conditions, dropna=False)[list(METRICS)].mean()
         self.log.validation(by_condition.reset_index())
         score = validation_score(by_condition, self.validate.steps)
-        if score > self.best_score:
-            self.best_score = score
-            self._save(iteration, best=True)
+        best = self.progress.best_score
+        if best is None or score > best:
+            self.progress = replace(self.progress, best_score=score, best_iterations=iteration + 1)
         record = {"validation/score": score}
         for values in by_condition.reset_index().to_dict("records"):
             label = next((f"{values[key]:g}" for key in conditions if not math.isnan(values[key])), "all")
             record |= {f"validation/{metric}/{label}": float(values[metric]) for metric in METRICS}
         return record
 
-    def _save(self, iteration: int, *, best: bool = False) -> Path:
-        progress = {
-            "iteration": iteration,
-            "steps": self.steps,
-            "updates": self.updates,
-            "best_score": self.best_score,
-        }
-        return self.checkpoints.save("best" if best else "last", progress)
+    def _save(self) -> None:
+        self.checkpoints.save(self.progress, self.log.lengths())

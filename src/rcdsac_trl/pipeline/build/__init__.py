@@ -1,6 +1,7 @@
 """From the config to objects: the only package that reads ``cfg``."""
 
 from rcdsac_trl.pipeline.build.evaluation import evaluation
-from rcdsac_trl.pipeline.build.training import check_training, run_folder, trainer
+from rcdsac_trl.pipeline.build.resume import run_to_continue
+from rcdsac_trl.pipeline.build.training import check_training, resumed, run_folder, trainer
 
-__all__ = ["check_training", "evaluation", "run_folder", "trainer"]
+__all__ = ["check_training", "evaluation", "resumed", "run_folder", "run_to_continue", "trainer"]

@@ -1,5 +1,6 @@
 """An evaluation from its config."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -13,12 +14,13 @@ from rcdsac_trl.pipeline import logs, runtime
 from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_policy
 from rcdsac_trl.pipeline.build.read import evaluation_settings, settings_of_run, training_settings
 from rcdsac_trl.pipeline.build.world import evaluation_environment
-from rcdsac_trl.pipeline.checkpoint import load_manifest, load_weights
+from rcdsac_trl.pipeline.checkpoint import load_weights
 from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.evaluation import EvaluationRun, evaluate
 from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.policies import PursuitPolicy
 from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
+from rcdsac_trl.pipeline.saved import CHECKPOINTS, find
 from rcdsac_trl.pipeline.settings import WorldSettings
 from rcdsac_trl.seeding import torch_stream
 
@@ -37,8 +39,8 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     device = runtime.resolve_device(settings.device)
     name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
     if settings.run is not None:
-        checkpoints = Path(settings.run) / "checkpoints"
-        load_manifest(checkpoints, settings.checkpoint)
+        checkpoints = Path(settings.run) / CHECKPOINTS
+        find(checkpoints, settings.checkpoint)
         told = "".join(f"-{condition}".replace("=", "_") for condition in conditions)
         default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{told}"
     else:
@@ -53,7 +55,8 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
             policy: TensorDictModuleBase = PursuitPolicy()
         else:
             average = make_average(make_loss(trained, device), trained.learner)
-            load_weights(checkpoints, settings.checkpoint, average=average)
+            for damaged in load_weights(checkpoints, settings.checkpoint, average=average):
+                print(f"rcdsac_trl: {damaged}", file=sys.stderr)
             generator = torch_stream(settings.seed, "evaluation actions", device=device)
             policy = make_policy(average.module, env, generator, device)
         try:

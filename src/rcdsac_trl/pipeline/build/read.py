@@ -35,15 +35,19 @@ def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
     return read(EvaluationSettings, _plain(cfg))
 
 
-def settings_of_run(folder: Path) -> TrainingSettings:
+def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
     """Read what a run was trained with.
+
+    Args:
+        folder: of the run.
+        key: the key that named it, for messages.
 
     Raises:
         UserInputError: if the folder holds no run, or one that this version cannot read.
     """
     path = folder / CONFIG_NAME
     if not path.is_file():
-        raise UserInputError(f"run={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
+        raise UserInputError(f"{key}={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
     try:
         cfg = OmegaConf.load(path)
         if not isinstance(cfg, DictConfig):

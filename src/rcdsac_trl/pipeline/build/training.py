@@ -1,5 +1,7 @@
 """A training run from its config."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -8,7 +10,7 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.pipeline import logs, runtime
 from rcdsac_trl.pipeline.build.agent import (
@@ -19,18 +21,23 @@ from rcdsac_trl.pipeline.build.agent import (
     make_relabel,
     parameters,
 )
-from rcdsac_trl.pipeline.build.read import training_settings
+from rcdsac_trl.pipeline.build.read import settings_of_run, training_settings
 from rcdsac_trl.pipeline.build.world import environment, evaluation_environment
-from rcdsac_trl.pipeline.checkpoint import Checkpoints
+from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators
+from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.evaluation import Validation
+from rcdsac_trl.pipeline.guard import FiniteGuard
 from rcdsac_trl.pipeline.policies import CollectionPolicy
 from rcdsac_trl.pipeline.replay import SequenceReplay
+from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
+from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, Saved, best_damage, newest
 from rcdsac_trl.pipeline.trainer import Learner, Trainer
 from rcdsac_trl.world.lidar import sensor_mask
 
 # Validation looks at the same maps whatever seed a run is trained with.
 VALIDATION_SEED = 0
+REPLAY = "replay"
 
 
 def run_folder() -> Path:
@@ -61,23 +68,120 @@ def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
 
 
 def trainer(cfg: DictConfig, folder: Path) -> Trainer:
-    """Make a training run that writes into a folder."""
+    """Make a new training run that writes into a folder."""
     settings = training_settings(cfg)
-    algo, schedule, world = settings.algo, settings.schedule, settings.training_world
-    device, threads = runtime.resolve_device(settings.device), runtime.set_threads(settings.threads)
-    facts = {"device": device, "threads": threads, "allocator": runtime.allocator()}
+    logs.check_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FolderLock(folder)
+    facts = {
+        "device": runtime.resolve_device(settings.device),
+        "threads": runtime.resolve_threads(settings.threads),
+        "allocator": runtime.allocator(),
+    }
     logs.start_run_folder(folder, cfg, facts)
+    return _assemble(settings, folder, lock, None, [])
 
+
+def resumed(folder: Path) -> Trainer | None:
+    """Make the trainer that continues a run in its folder, as its config says; None if the run is finished.
+
+    Raises:
+        UserInputError: if another process trains in it, or it has checkpoints and none is whole.
+    """
+    settings = settings_of_run(folder, key="resume")
+    lock = FolderLock(folder)
+    try:
+        saved, damaged = newest(folder / CHECKPOINTS, replay=folder / REPLAY) if has_begun(folder) else (None, [])
+        if saved is not None and saved.progress.iterations == settings.schedule.iterations:
+            lock.close()
+            return None
+        return _assemble(settings, folder, lock, saved, damaged)
+    except BaseException:
+        lock.close()
+        raise
+
+
+def has_begun(folder: Path) -> bool:
+    """Whether a run has saved or driven anything; one that has not can only be begun."""
+    return (folder / "training_episodes.csv").exists() or any((folder / CHECKPOINTS).glob("[!.]*"))
+
+
+def _assemble(
+    settings: TrainingSettings, folder: Path, lock: FolderLock, saved: Saved | None, told: list[str]
+) -> Trainer:
+    device, threads = runtime.resolve_device(settings.device), runtime.set_threads(settings.threads)
     loss = make_loss(settings, device)
     average = make_average(loss, settings.learner)
     optimizer = make_optimizer(loss, settings.learner)
+    relabel = make_relabel(settings, device)
+    learner = Learner(
+        replay=make_replay(settings, device),
+        loss=loss,
+        relabel=relabel,
+        optimizer=optimizer,
+        targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
+        clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],
+        max_grad_norm=settings.learner.max_grad_norm,
+        average=average,
+    )
+    generators = {"replay": learner.replay.generator}
+    if relabel is not None and relabel.generator is not None:
+        generators["relabel"] = relabel.generator
+    checkpoints = Checkpoints(
+        folder / CHECKPOINTS,
+        {"loss": loss, "average": average, "optimizer": optimizer, "generators": Generators(**generators)},
+        replay=ReplayFiles(folder / REPLAY, learner.replay),
+        keep=settings.checkpoint.keep,
+    )
+    progress = Progress()
+    if saved is not None:
+        progress, more = _restore(folder, checkpoints, saved)
+        total = settings.schedule.iterations
+        told = [*told, *more, f"continue after {progress.iterations} of {total} iterations, from {saved.path}"]
+    log = logs.RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
+    for sentence in [*told, f"device {device}, {threads} threads, allocator: {runtime.allocator()}"]:
+        log.message(sentence)
+    collector, set_iteration = _collection(settings, loss, device, progress.iterations)
+    return Trainer(
+        schedule=settings.schedule,
+        progress=progress,
+        collector=collector,
+        set_iteration=set_iteration,
+        learner=learner,
+        guard=FiniteGuard(folder, loss, optimizer),
+        validate=_validation(settings, average.module, device),
+        validate_every=settings.validation.every_iterations,
+        checkpoints=checkpoints,
+        checkpoint_every=settings.checkpoint.every_iterations,
+        log=log,
+        lock=lock,
+        context_key=settings.algo.context_key,
+    )
+
+
+def _restore(folder: Path, checkpoints: Checkpoints, saved: Saved) -> tuple[Progress, list[str]]:
+    """Bring components and logs back to a checkpoint; return the progress, and what the user should know."""
+    checkpoints.restore(saved)
+    told = logs.cut(folder, saved.logs)
+    damage = best_damage(checkpoints.folder, saved.progress)
+    if damage is None:
+        return saved.progress, told
+    return replace(saved.progress, best_score=None, best_iterations=None), [*told, damage]
+
+
+def _collection(
+    settings: TrainingSettings, loss: LossModule, device: str, first_iteration: int
+) -> tuple[Collector, Callable[[int], None]]:
+    """Make what yields the episodes of each iteration, and what must be told an iteration before them."""
+    schedule, world = settings.schedule, settings.training_world
     env = environment(
         world,
-        algo,
+        settings.algo,
         split="train",
         seed=settings.seed,
         agent_ids=range(world.num_agents),
         memory=settings.network.memory,
+        first_episode=first_iteration,  # iteration i is episode i of every agent, on map i
     )
     exploration = torch.Generator(device=device)
     policy = CollectionPolicy(
@@ -87,40 +191,17 @@ def trainer(cfg: DictConfig, folder: Path) -> Trainer:
         pursuit_iterations=schedule.pursuit_iterations,
         pursuit_noise=schedule.pursuit_noise,
     )
+    iteration_steps = world.num_agents * world.task.episode_steps
     collector = Collector(
         env,
         policy,
-        frames_per_batch=world.num_agents * world.task.episode_steps,
-        total_frames=schedule.iterations * world.num_agents * world.task.episode_steps,
+        frames_per_batch=iteration_steps,
+        total_frames=(schedule.iterations - first_iteration) * iteration_steps,
         exploration_type=ExplorationType.RANDOM,
         trust_policy=True,
         use_buffers=False,
     )
-    clipped = [parameters(loss.actor_network_params), parameters(loss.critic_network_params)]
-    learner = Learner(
-        replay=make_replay(settings, device),
-        loss=loss,
-        relabel=make_relabel(settings, device),
-        optimizer=optimizer,
-        targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
-        clipped=clipped,
-        max_grad_norm=settings.learner.max_grad_norm,
-        average=average,
-    )
-    log = logs.RunLog(folder, settings.logger.backends)
-    log.message(f"device {device}, {threads} threads, allocator: {runtime.allocator()}")
-    return Trainer(
-        schedule=schedule,
-        collector=collector,
-        set_iteration=policy.set_iteration,
-        learner=learner,
-        validate=_validation(settings, average.module, device),
-        validate_every=settings.validation.every_iterations,
-        checkpoints=Checkpoints(folder / "checkpoints", loss, average, optimizer),
-        checkpoint_every=settings.checkpoint.every_iterations,
-        log=log,
-        context_key=algo.context_key,
-    )
+    return collector, policy.set_iteration
 
 
 def _validation(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> Validation:

@@ -21,6 +21,7 @@ def environment(
     agent_ids: Sequence[int],
     memory: int,
     conditions: Sequence[Condition] | None = None,
+    first_episode: int = 0,
 ) -> EnvBase:
     """Make an environment with everything a policy reads.
 
@@ -32,6 +33,7 @@ def environment(
         agent_ids: numbers of the agents; equal numbers meet the same starts and goals.
         memory: size of the policy's recurrent state.
         conditions: tell agent i ``conditions[i]``; None draws what they are told an episode.
+        first_episode: number of each agent's first episode.
     """
     weighted = algo is not None and algo.collision_weight is not None
     base = make_env(
@@ -42,6 +44,7 @@ def environment(
         seed=seed,
         agent_ids=agent_ids,
         num_workers=world.num_workers,
+        first_episode=first_episode,
         weighted_collisions=weighted,
         gui=world.gui,
     )
@@ -50,7 +53,7 @@ def environment(
     env.append_transform(StepCounter(max_steps=world.task.episode_steps))
     env.append_transform(recurrent_state_primer(memory))
     if algo is not None and algo.context_key is not None:
-        env.append_transform(_told(algo, seed, agent_ids, conditions))
+        env.append_transform(_told(algo, seed, agent_ids, conditions, first_episode))
     return env
 
 
@@ -59,6 +62,7 @@ def _told(
     seed: int,
     agent_ids: Sequence[int],
     conditions: Sequence[Condition] | None,
+    first_episode: int,
 ) -> EpisodeSampler:
     fixed: list[float] | None = None
     if algo.collision_weight is not None:
@@ -66,7 +70,12 @@ def _told(
         if conditions is not None:
             fixed = [c.collision_weight for c in conditions if c.collision_weight is not None]
         return EpisodeSampler(
-            "collision_weight", lambda u, episode: low + (high - low) * u, seed=seed, agent_ids=agent_ids, fixed=fixed
+            "collision_weight",
+            lambda u, episode: low + (high - low) * u,
+            seed=seed,
+            agent_ids=agent_ids,
+            first_episode=first_episode,
+            fixed=fixed,
         )
     measure = algo.distortion.measure
     if conditions is not None:
@@ -76,6 +85,7 @@ def _told(
         lambda u, episode: measure.from_uniform(u),
         seed=seed,
         agent_ids=agent_ids,
+        first_episode=first_episode,
         fixed=fixed,
     )
 

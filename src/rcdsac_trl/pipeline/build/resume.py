@@ -1,0 +1,112 @@
+"""Which run `resume` means; the run's own config holds, so nothing else may be asked of it."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline.build.read import settings_of_run
+from rcdsac_trl.pipeline.build.training import check_training, has_begun
+from rcdsac_trl.pipeline.cli import compose, output_folder
+from rcdsac_trl.pipeline.logs import CONFIG_NAME
+from rcdsac_trl.pipeline.saved import CHECKPOINTS, newest
+
+AUTO = "auto"
+
+
+def run_to_continue(overrides: list[str], *, multirun: bool) -> Path | None:
+    """Find the run that a call of `train` continues.
+
+    Args:
+        overrides: of the command line.
+        multirun: whether it starts several runs.
+
+    Returns:
+        The run's folder; None if the call starts a new one.
+
+    Raises:
+        UserInputError: for a folder that holds no run, overrides that contradict the run, and runs that cannot be told
+            apart from others.
+    """
+    if not any(_key(override) == "resume" for override in overrides):
+        return None
+    if multirun:
+        raise UserInputError("resume continues one run: leave -m out, or leave resume out")
+    cfg = compose("train", overrides)
+    if cfg.resume is None:
+        return None
+    if cfg.resume == AUTO:
+        check_training(cfg)
+        return _newest_unfinished(overrides)
+    folder = Path(str(cfg.resume))
+    settings_of_run(folder, key="resume")
+    _check_overrides(folder, overrides)
+    return folder
+
+
+def _newest_unfinished(overrides: list[str]) -> Path | None:
+    wanted = _comparable(compose("train", overrides))
+    there = output_folder("train", overrides)
+    if (there / CONFIG_NAME).exists():  # the call names its folder: that run or none
+        if _config(there) != wanted:
+            raise UserInputError(f"{there} holds a run of another config: choose another hydra.run.dir")
+        return there
+    started = {path.parent: path.stat().st_mtime_ns for path in there.parent.glob(f"*/{CONFIG_NAME}")}
+    for folder in sorted(started, key=lambda folder: started[folder], reverse=True):
+        if _config(folder) == wanted and not _is_finished(folder):
+            print(f"resume=auto: continue {folder}")
+            return folder
+    print(f"resume=auto: no unfinished run of this config in {there.parent}, so a new one")
+    return None
+
+
+def _is_finished(folder: Path) -> bool:
+    if not has_begun(folder):
+        return False
+    saved, _ = newest(folder / CHECKPOINTS)
+    return saved.progress.iterations == settings_of_run(folder).schedule.iterations
+
+
+def _check_overrides(folder: Path, overrides: list[str]) -> None:
+    """Refuse what would make the run another one; what it was started with, and what changes nothing, may stand."""
+    recorded = folder / ".hydra" / "overrides.yaml"
+    own = yaml.safe_load(recorded.read_text()) if recorded.is_file() else []
+    own = [override for override in own if _key(override) != "resume"]
+    for override in overrides:
+        key = _key(override)
+        if override in own or key == "resume":
+            continue
+        if key == "hydra.run.dir" and Path(override.partition("=")[2]).resolve() == folder.resolve():
+            continue
+        if key.startswith("hydra") or _changes(own, override):
+            raise UserInputError(
+                f"{override} is not what {folder} was started with, and resume continues a run as it was: leave it "
+                "out, or start a new run without resume"
+            )
+
+
+def _changes(own: list[str], override: str) -> bool:
+    others = [other for other in own if _key(other) != _key(override)]
+    return _comparable(compose("train", own)) != _comparable(compose("train", [*others, override]))
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _config(folder: Path) -> dict[str, Any] | None:
+    """Read a run's config; None if there is nothing to compare."""
+    try:
+        cfg = OmegaConf.load(folder / CONFIG_NAME)
+    except (OSError, yaml.YAMLError, OmegaConfBaseException):
+        return None
+    return _comparable(cfg) if isinstance(cfg, DictConfig) else None
+
+
+def _comparable(cfg: DictConfig) -> dict[str, Any]:
+    values: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    values.pop("resume", None)
+    return values

@@ -1,0 +1,96 @@
+"""Trains tiny runs in processes that die of SIGKILL at an event that the test names; see test_resume.py.
+
+Started once as a program, so that importing and compiling is paid once; each line on standard input is a job, and
+each job a fork of this process. Events are counted, so that where a run dies does not depend on the clock.
+"""
+
+import json
+import os
+import shutil
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rcdsac_trl.pipeline import build
+from rcdsac_trl.pipeline.logs import RunLog
+from rcdsac_trl.pipeline.replay import SequenceReplay
+from rcdsac_trl.pipeline.trainer import Learner
+from rcdsac_trl.world.env import NavigationEnv
+from tiny import evaluate, tiny_trainer
+
+SAVING = [(os, "fsync"), (os, "rename"), (os, "truncate"), (os, "unlink"), (shutil, "rmtree")]
+TRAINING = [
+    (RunLog, "episodes"),
+    (RunLog, "scalars"),
+    (SequenceReplay, "add_episodes"),
+    (Learner, "update"),
+    (NavigationEnv, "_step"),
+]
+
+
+class Events:
+    """Names every call of what is watched, and kills the process before the call of a given number."""
+
+    def __init__(self, kill_at: int | None) -> None:
+        self.kill_at = kill_at
+        self.names: list[str] = []
+        for owner, name in [*SAVING, *TRAINING]:
+            setattr(owner, name, self.watched(getattr(owner, name), name))
+
+    def watched(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if len(self.names) == self.kill_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+            self.names.append(name)
+            return function(*args, **kwargs)
+
+        return call
+
+
+def work(job: dict[str, Any]) -> None:
+    """Do a job, as the command line does it, and write down what happened."""
+    folder = Path(job["folder"])
+    events = Events(job["kill_at"])
+    if job["do"] == "train":
+        tiny_trainer(folder, job["row"], *job["overrides"]).run()
+    else:
+        trainer = build.resumed(folder)
+        if trainer is not None:
+            trainer.run()
+    happened = list(events.names)
+    for name in job["evaluate"]:
+        evaluate(f"run={folder}", *job["told"], f"checkpoint={name}", f"out={folder / 'evaluation' / name}")
+    Path(job["out"]).write_text(json.dumps(happened))
+
+
+def main() -> None:
+    """Do jobs until standard input ends; answer each with the status of its process."""
+    torch.set_num_threads(1)
+    answers = os.fdopen(os.dup(1), "w")  # what trainings print goes elsewhere
+    for line in sys.stdin:
+        job = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            log = os.open(job["out"] + ".log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            os.dup2(log, 1)
+            os.dup2(log, 2)
+            code = 0
+            try:
+                work(job)
+            except BaseException:
+                traceback.print_exc()
+                code = 1
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+        answers.write(f"{os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])}\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()
