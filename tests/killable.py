@@ -12,6 +12,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -34,19 +35,20 @@ TRAINING = [
 
 
 class Events:
-    """Names every call of what is watched, and kills the process before the call of a given number."""
+    """Counts every call of what is watched, and kills the process before the call of a given kind and number."""
 
-    def __init__(self, kill_at: int | None) -> None:
+    def __init__(self, kill_at: tuple[str, int] | None) -> None:
         self.kill_at = kill_at
-        self.names: list[str] = []
-        for owner, name in [*SAVING, *TRAINING]:
-            setattr(owner, name, self.watched(getattr(owner, name), name))
+        self.counted = {"saving": 0, "training": 0}
+        for kind, watched in (("saving", SAVING), ("training", TRAINING)):
+            for owner, name in watched:
+                setattr(owner, name, self.watched(getattr(owner, name), kind))
 
-    def watched(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    def watched(self, function: Callable[..., Any], kind: str) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            if len(self.names) == self.kill_at:
+            if (kind, self.counted[kind]) == self.kill_at:
                 os.kill(os.getpid(), signal.SIGKILL)
-            self.names.append(name)
+            self.counted[kind] += 1
             return function(*args, **kwargs)
 
         return call
@@ -55,14 +57,14 @@ class Events:
 def work(job: dict[str, Any]) -> None:
     """Do a job, as the command line does it, and write down what happened."""
     folder = Path(job["folder"])
-    events = Events(job["kill_at"])
+    events = Events(tuple(job["kill_at"]) if job["kill_at"] is not None else None)
     if job["do"] == "train":
         tiny_trainer(folder, job["row"], *job["overrides"]).run()
     else:
         trainer = build.resumed(folder)
         if trainer is not None:
             trainer.run()
-    happened = list(events.names)
+    happened = dict(events.counted)
     for name in job["evaluate"]:
         evaluate(f"run={folder}", *job["told"], f"checkpoint={name}", f"out={folder / 'evaluation' / name}")
     Path(job["out"]).write_text(json.dumps(happened))
@@ -71,7 +73,10 @@ def work(job: dict[str, Any]) -> None:
 def main() -> None:
     """Do jobs until standard input ends; answer each with the status of its process."""
     torch.set_num_threads(1)
-    answers = os.fdopen(os.dup(1), "w")  # what trainings print goes elsewhere
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what trainings print goes elsewhere
+    with TemporaryDirectory() as folder:  # what is compiled and which maps are made, all forks then have
+        tiny_trainer(Path(folder), "rcdsac_pow", *json.loads(sys.argv[1]), "logger=none").run()
     for line in sys.stdin:
         job = json.loads(line)
         child = os.fork()

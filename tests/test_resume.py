@@ -24,6 +24,7 @@ from tiny import evaluation_betas
 # Ten episodes pass through a replay of seven: it wraps in the middle of an iteration.
 RUN = [
     "schedule.iterations=5",
+    "network={conv: 4, range: 8, vector: 4, memory: 8, head: 8, cosines: 4}",
     "schedule.ramp_iterations=2",
     "schedule.decay_iterations=3",
     "schedule.pursuit_iterations=2",
@@ -34,7 +35,7 @@ RUN = [
     "algo.distortion.evaluation_betas=[-1]",
     "logger=default",
 ]
-SAVING = {"fsync", "rename", "truncate", "unlink", "rmtree"}
+Counted = dict[str, int]
 
 
 class Server:
@@ -45,15 +46,15 @@ class Server:
         self.numbers = count()
         path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
         self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("killable.py"))],
+            [sys.executable, str(Path(__file__).with_name("killable.py")), json.dumps(RUN)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "RL_LOGGING_LEVEL": "WARNING"},
         )
 
-    def call(self, do: str, run: Path, *, kill_at: int | None = None, **changes: Any) -> list[str] | None:
-        """Train or resume; return the events, or None if it was killed."""
+    def call(self, do: str, run: Path, *, kill_at: tuple[str, int] | None = None, **changes: Any) -> Counted | None:
+        """Train or resume; return how many events of each kind happened, or None if it was killed."""
         job = {"row": "rcdsac_pow", "overrides": RUN, "evaluate": [], "told": ["beta=[-1]"]} | changes
         out = self.folder / f"job{next(self.numbers)}"
         job |= {"do": do, "folder": str(run), "kill_at": kill_at, "out": str(out)}
@@ -67,9 +68,7 @@ class Server:
         return json.loads(out.read_text())  # type: ignore[no-any-return]
 
     def close(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self.process.wait()
+        self.process.communicate()
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +79,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.fixture(scope="module")
-def whole(server: Server, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
-    """A run that nobody disturbed, and what happened in it."""
+def whole(server: Server, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Counted]:
+    """A run that nobody disturbed, and how many events of each kind happened in it."""
     run = tmp_path_factory.mktemp("whole") / "run"
     events = server.call("train", run, evaluate=["best", "last"])
     assert events is not None
@@ -149,26 +148,34 @@ def assert_equal_runs(run: Path, whole: Path) -> None:
     assert not list(run.rglob(".removed*"))
 
 
-def kill_points(events: list[str], number: int, seed: int) -> list[int]:
-    """Draw moments, half of them while something is saved."""
+def kill_and_resume(server: Server, run: Path, kills: list[tuple[str, int]]) -> None:
+    """Start a run, kill it again and again wherever it is, and let it come to its end."""
+    for kill_at in kills:
+        server.call("resume" if (run / "config.yaml").exists() else "train", run, kill_at=kill_at)
+    server.call("resume" if (run / "config.yaml").exists() else "train", run, evaluate=["best", "last"])
+
+
+def kill_points(counted: Counted, number: int, share: float, seed: int) -> list[tuple[str, int]]:
+    """Draw moments within a share of a run's events, every other one while something is saved."""
     rng = np.random.default_rng(seed)
-    saving = [i for i, name in enumerate(events) if name in SAVING]
-    other = [i for i, name in enumerate(events) if name not in SAVING]
-    drawn = [rng.choice(saving, number // 2, replace=False), rng.choice(other, number - number // 2, replace=False)]
-    return sorted(np.concatenate(drawn).tolist())
+    kinds = ["saving", "training"] * number
+    return [(kind, int(rng.integers(share * counted[kind]))) for kind in kinds[:number]]
 
 
-def kill_and_resume(server: Server, run: Path, kill_at: int) -> None:
-    assert server.call("train", run, kill_at=kill_at) is None
-    if (run / "config.yaml").exists():
-        server.call("resume", run, evaluate=["best", "last"])
-    else:  # it died before it was a run
-        server.call("train", run, evaluate=["best", "last"])
-
-
-@pytest.mark.parametrize("number", range(12))
-def test_a_killed_run_ends_as_if_nothing_had_happened(
-    server: Server, whole: tuple[Path, list[str]], tmp_path: Path, number: int
+@pytest.mark.parametrize("seed", range(3))
+def test_a_run_killed_again_and_again_ends_as_if_nothing_had_happened(
+    server: Server, whole: tuple[Path, Counted], tmp_path: Path, seed: int
 ) -> None:
-    kill_and_resume(server, tmp_path / "run", kill_points(whole[1], 12, seed=0)[number])
+    kill_and_resume(server, tmp_path / "run", kill_points(whole[1], 4, 0.5, seed))
     assert_equal_runs(tmp_path / "run", whole[0])
+    assert scalars_shown(tmp_path / "run") == scalars_shown(whole[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(60))
+def test_a_run_killed_once_ends_as_if_nothing_had_happened(
+    server: Server, whole: tuple[Path, Counted], tmp_path: Path, number: int
+) -> None:
+    kill_and_resume(server, tmp_path / "run", kill_points(whole[1], 60, 1.0, 99)[number : number + 1])
+    assert_equal_runs(tmp_path / "run", whole[0])
+    assert scalars_shown(tmp_path / "run") == scalars_shown(whole[0])
