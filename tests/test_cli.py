@@ -14,9 +14,9 @@ import tiny
 from rcdsac_trl import evaluate, train
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import build
-from rcdsac_trl.pipeline.checkpoint import load_manifest
 from rcdsac_trl.pipeline.cli import choices, compose, precheck
 from rcdsac_trl.pipeline.evaluation import EvaluationRun
+from rcdsac_trl.pipeline.saved import load_progress
 from tiny import ROWS, TINY
 
 POW = "+algo=rcdsac_pow"
@@ -325,9 +325,8 @@ def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -
     assert "Traceback" not in err
     assert err.splitlines()[-1] == "rcdsac_trl: interrupted"
     run = tmp_path / "run"
-    progress = load_manifest(run / "checkpoints", "last")
-    assert progress["updates"] >= 2
-    assert "save and stop" in (run / "train.log").read_text()
+    assert load_progress(run / "checkpoints", "last").updates >= 2
+    assert f" are saved, resume={run} continues there" in (run / "train.log").read_text()
     assert (run / "training_episodes.csv").exists()
 
 
@@ -336,4 +335,4 @@ def test_ctrl_c_with_workers(tmp_path: Path) -> None:
     code, err = interrupt(tmp_path, "world.num_workers=2")
     assert code == 130
     assert "Traceback" not in err
-    assert load_manifest(tmp_path / "run" / "checkpoints", "last")["updates"] >= 2
+    assert load_progress(tmp_path / "run" / "checkpoints", "last").updates >= 2

@@ -4,6 +4,7 @@ import importlib
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,14 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import build, evaluation
-from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_optimizer
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss
 from rcdsac_trl.pipeline.build.world import evaluation_environment
-from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_manifest, load_weights
+from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_weights
 from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.evaluation import EvaluationRun, run_episodes
 from rcdsac_trl.pipeline.metrics import METRICS, Condition
 from rcdsac_trl.pipeline.policies import PursuitPolicy
+from rcdsac_trl.pipeline.saved import load_progress
 from rcdsac_trl.pipeline.settings import WorldSettings
 from rcdsac_trl.world.env import make_env
 from tiny import evaluate, tiny_settings, tiny_trainer
@@ -335,15 +337,16 @@ def test_the_named_checkpoint_drives(run: Path, tmp_path: Path) -> None:
     loss = make_loss(settings, "cpu")
     average = make_average(loss, settings.learner)
     load_weights(changed / "checkpoints", "best", loss=loss, average=average)
-    checkpoints = Checkpoints(changed / "checkpoints", loss, average, make_optimizer(loss, settings.learner))
-    checkpoints.save("last", load_manifest(changed / "checkpoints", "best"))
+    best_progress = load_progress(changed / "checkpoints", "last")
+    checkpoints = Checkpoints(changed / "checkpoints", {"loss": loss, "average": average}, replay=None, keep=10)
+    checkpoints.save(replace(best_progress, iterations=90), {})
     given = [f"run={changed}", "beta=[-1]"]
     best = contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"]
     assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'same'}"))["episodes.csv"] == best
     with torch.no_grad():
         for value in average.module.parameters():
             value.mul_(2.0)
-    checkpoints.save("last", {})
+    checkpoints.save(replace(best_progress, iterations=91), {})
     assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'other'}"))["episodes.csv"] != best
     assert contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"] == best
 

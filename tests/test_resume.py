@@ -1,7 +1,6 @@
 """A run that dies at any moment and is continued ends as if nothing had happened, bit for bit."""
 
 import json
-import logging
 import os
 import shutil
 import signal
@@ -13,13 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import Checkpoint
 
-from rcdsac_trl.pipeline.saved import folders
-from tiny import evaluation_betas
+from rcdsac_trl import train
+from rcdsac_trl.pipeline import build
+from rcdsac_trl.pipeline.durable import FolderLock
+from rcdsac_trl.pipeline.logs import cut, lengths
+from rcdsac_trl.pipeline.saved import folders, newest
+from test_checkpoint import DAMAGE
+from tiny import TINY, tiny_trainer
 
 # Ten episodes pass through a replay of seven: it wraps in the middle of an iteration.
 RUN = [
@@ -172,6 +177,18 @@ def test_a_run_killed_again_and_again_ends_as_if_nothing_had_happened(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("row", ["sac", "rcwr", "rcdsac_cvar_stored", "dsac_pow"])
+def test_every_kind_of_row_goes_on(server: Server, tmp_path: Path, row: str) -> None:
+    changes: dict[str, Any] = {"row": row, "overrides": [key for key in RUN if "evaluation_betas" not in key]}
+    counted = server.call("train", tmp_path / "whole", **changes)
+    assert counted is not None
+    run = tmp_path / "run"
+    server.call("train", run, kill_at=("training", counted["training"] * 2 // 3), **changes)
+    server.call("resume", run)
+    assert_equal_runs(run, tmp_path / "whole")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(60))
 def test_a_run_killed_once_ends_as_if_nothing_had_happened(
     server: Server, whole: tuple[Path, Counted], tmp_path: Path, number: int
@@ -179,3 +196,229 @@ def test_a_run_killed_once_ends_as_if_nothing_had_happened(
     kill_and_resume(server, tmp_path / "run", kill_points(whole[1], 60, 1.0, 99)[number : number + 1])
     assert_equal_runs(tmp_path / "run", whole[0])
     assert scalars_shown(tmp_path / "run") == scalars_shown(whole[0])
+
+
+# ------------------------------------------------------------------------------------------------ damage, in a real run
+QUICK = [*RUN, "schedule.iterations=3", "validation.every_iterations=1", "logger.backends=[csv]"]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of three iterations; tests copy it."""
+    run = tmp_path_factory.mktemp("short") / "run"
+    tiny_trainer(run, "rcdsac_pow", *QUICK).run()
+    return run
+
+
+@pytest.fixture
+def copied(short: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(short, tmp_path / "copied"))
+
+
+def files_of(run: Path) -> dict[str, bytes]:
+    return {path.relative_to(run).as_posix(): path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("kind", ["flipped byte", "record truncated", "empty folder", "segment missing"])
+def test_a_run_goes_on_from_the_last_good_checkpoint_and_ends_the_same(short: Path, copied: Path, kind: str) -> None:
+    where, damage, reason = DAMAGE[kind]
+    where = where.replace("0000-number", "0002-loss").replace("00000002", "00000004")
+    damage(copied / "checkpoints" / where)
+    trainer = build.resumed(copied)
+    assert trainer is not None
+    assert trainer.progress.iterations == 2
+    trainer.run()
+    assert_equal_runs(copied, short)
+    log = (copied / "train.log").read_text()
+    assert log.count("is damaged") == 1
+    assert reason.replace("0000-number", "0002-loss") in log
+    assert f"continue after 2 of 3 iterations, from {copied / 'checkpoints' / 'iteration-000002'}" in log
+
+
+def test_a_run_without_a_good_checkpoint_is_not_begun_anew(refusal: Any, copied: Path) -> None:
+    for checkpoint in folders(copied / "checkpoints"):
+        (checkpoint / "manifest.json").unlink()
+    before = files_of(copied)
+    told = refusal([f"resume={copied}"])
+    assert told.startswith(f"no checkpoint in {copied / 'checkpoints'} is whole: ")
+    shutil.rmtree(copied / "checkpoints")
+    told = refusal([f"resume={copied}"])
+    assert told == f"there is no checkpoint in {copied / 'checkpoints'}: has this run saved one yet?"
+    assert files_of(copied).items() <= before.items()
+
+
+def test_a_damaged_best_checkpoint_is_said_and_found_anew(copied: Path) -> None:
+    last = folders(copied / "checkpoints")[-1]
+    (last / "checkpoint.json").unlink()
+    saved, _ = newest(copied / "checkpoints")
+    best = copied / "checkpoints" / f"iteration-{saved.progress.best_iterations:06d}"
+    if best == saved.path:
+        pytest.skip("the best one is the last good one, so its damage makes it no good")
+    (best / "manifest.json").unlink()
+    trainer = build.resumed(copied)
+    assert trainer is not None
+    trainer.run()
+    assert "the next validation finds a new best one" in (copied / "train.log").read_text()
+    assert newest(copied / "checkpoints")[0].progress.best_iterations == 3
+
+
+# ------------------------------------------------------------------------------------------------ logs
+def test_logs_are_cut_to_what_they_were(tmp_path: Path) -> None:
+    scalars = tmp_path / "csv" / "scalars" / "train"
+    scalars.mkdir(parents=True)
+    table, scalar, note = tmp_path / "training_episodes.csv", scalars / "reward.csv", tmp_path / "notes.csv"
+    for path in (table, scalar, note):
+        path.write_text("a\nb\n")
+    recorded = lengths(tmp_path)
+    assert recorded == {"training_episodes.csv": 4, "csv/scalars/train/reward.csv": 4}
+    table.write_text("a\nb\nc\nd")
+    (tmp_path / "validation_episodes.csv").write_text("later\n")
+    scalar.write_text("a\n")
+    assert cut(tmp_path, recorded) == [f"{scalar} has lost rows: it holds 2 bytes of 4"]
+    assert table.read_text() == "a\nb\n"
+    assert not (tmp_path / "validation_episodes.csv").exists()
+    assert note.read_text() == "a\nb\n", "what a user put there stays"
+
+
+# ------------------------------------------------------------------------------------------------ the command line
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Call `train` as the command line does, in this process."""
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else the process would start again
+
+    def call(arguments: list[str]) -> None:
+        monkeypatch.setattr(sys, "argv", ["prog", *arguments])
+        train.main()
+
+    return call
+
+
+@pytest.fixture
+def refusal(command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Any:
+    """Call `train`, which must refuse and write nothing; return the sentence."""
+    monkeypatch.setattr(build, "trainer", lambda *_: pytest.fail("it was not refused"))
+
+    def call(arguments: list[str]) -> str:
+        before = files_of(tmp_path)
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as left:
+            command(arguments)
+        assert left.value.code == 2
+        assert {name for name in files_of(tmp_path) if not name.endswith("lock")} == {
+            name for name in before if not name.endswith("lock")
+        }
+        err = capfd.readouterr().err
+        assert err.count("\n") == 1
+        return err.removeprefix("rcdsac_trl: ").strip()
+
+    return call
+
+
+START = ["+algo=rcdsac_pow", *TINY, *QUICK]
+
+
+def unfinished(run: Path) -> Path:
+    """Take a finished run back by an iteration."""
+    shutil.rmtree(folders(run / "checkpoints")[-1])
+    return run
+
+
+def test_a_finished_run_says_so_and_changes_nothing(command: Any, short: Path, capsys: Any) -> None:
+    before = files_of(short)
+    command([f"resume={short}"])
+    assert capsys.readouterr().out == f"{short} is finished: nothing is left to do\n"
+    assert files_of(short) == before
+
+
+def test_a_folder_is_continued_as_it_was_started(command: Any, copied: Path, short: Path, tmp_path: Path) -> None:
+    (copied / ".hydra").mkdir()
+    (copied / ".hydra" / "overrides.yaml").write_text("\n".join(f"- {override}" for override in START))
+    before = set(tmp_path.iterdir())
+    # What the run was started with, and what changes nothing, may be repeated.
+    command([*START, "seed=0", f"resume={unfinished(copied)}", f"hydra.run.dir={copied}"])
+    assert_equal_runs(copied, short)
+    assert set(tmp_path.iterdir()) == before
+    assert len(pd.read_csv(copied / "training_episodes.csv")) == 6
+
+
+@pytest.mark.parametrize(
+    "override", ["learner.gamma=0.5", "schedule.iterations=9", "sensor=sparse", "+algo=sac", "hydra.run.dir=other"]
+)
+def test_what_contradicts_a_run_is_refused_by_name(refusal: Any, copied: Path, override: str) -> None:
+    (copied / ".hydra").mkdir()
+    (copied / ".hydra" / "overrides.yaml").write_text("\n".join(f"- {override}" for override in START))
+    told = refusal([f"resume={unfinished(copied)}", override])
+    assert told == (
+        f"{override} is not what {copied} was started with, and resume continues a run as it was: leave it out, or "
+        "start a new run without resume"
+    )
+
+
+def test_wrong_folders_and_several_runs_are_refused(refusal: Any, tmp_path: Path) -> None:
+    told = refusal(["resume=nowhere"])
+    assert told == "resume=nowhere holds no config.yaml: name a folder that training wrote"
+    assert refusal(["-m", "resume=auto", "+algo=sac,rcwr"]) == (
+        "resume continues one run: leave -m out, or leave resume out"
+    )
+    assert refusal(["resume=auto"]).startswith("no algorithm chosen")
+    assert refusal(["resume=auto", "+algo=sac", "seed=-1"]) == "seed=-1 must be at least 0"
+
+
+def test_two_processes_never_train_in_one_folder(refusal: Any, copied: Path) -> None:
+    lock = FolderLock(unfinished(copied))
+    told = f"{copied} is being trained in by another process: wait for it, or stop it"
+    assert refusal([f"resume={copied}"]) == told
+    lock.close()
+    trainer = build.resumed(copied)
+    assert trainer is not None
+    assert refusal([f"resume={copied}"]) == told
+    trainer.run()
+    FolderLock(copied).close()
+
+
+def test_auto_finds_the_newest_unfinished_run_of_this_config_else_begins_one(
+    command: Any, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    runs = tmp_path / "runs"
+    for age, name in enumerate(("finished", "older", "newer", "other")):
+        run = Path(shutil.copytree(short, runs / name))
+        if name != "finished":
+            unfinished(run)
+        os.utime(run / "config.yaml", (1000 + age, 1000 + age))
+    config = runs / "other" / "config.yaml"
+    config.write_text(config.read_text().replace("seed: 0", "seed: 7"))
+    os.utime(config, (2000, 2000))
+    (runs / "no run").mkdir()
+    there = len(list(runs.iterdir()))
+    for name in ("newer", "older"):
+        command([*START, "resume=auto"])
+        assert f"resume=auto: continue runs/{name}\n" in capsys.readouterr().out
+        assert_equal_runs(runs / name, short)
+    assert len(list(runs.iterdir())) == there
+
+    begun: list[Path] = []
+
+    class Begun(Exception):
+        pass
+
+    def begin(cfg: object, folder: Path) -> None:
+        begun.append(folder)
+        raise Begun
+
+    monkeypatch.setattr(build, "trainer", begin)
+    with pytest.raises(Begun):
+        command([*START, "resume=auto", "hydra.run.dir=runs/new"])
+    assert "resume=auto: no unfinished run of this config in runs, so a new one\n" in capsys.readouterr().out
+    assert begun == [runs / "new"]
+
+
+def test_auto_with_a_named_folder_means_that_one(
+    command: Any, refusal: Any, short: Path, copied: Path, capsys: Any
+) -> None:
+    command([*START, "resume=auto", f"hydra.run.dir={unfinished(copied)}"])
+    assert_equal_runs(copied, short)
+    command([*START, "resume=auto", f"hydra.run.dir={copied}"])
+    assert capsys.readouterr().out.endswith(f"{copied} is finished: nothing is left to do\n")
+    told = refusal([*START, "seed=7", "resume=auto", f"hydra.run.dir={copied}"])
+    assert told == f"{copied} holds a run of another config: choose another hydra.run.dir"

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +14,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule, SoftUpdate
 
+from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.build.agent import make_loss
-from rcdsac_trl.pipeline.checkpoint import load_manifest, load_weights
+from rcdsac_trl.pipeline.checkpoint import load_weights
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS
+from rcdsac_trl.pipeline.saved import Progress, load_progress
 from rcdsac_trl.pipeline.settings import Schedule
 from rcdsac_trl.pipeline.trainer import LOSS_KEYS, Learner, Trainer
 from rcdsac_trl.world import episode
@@ -105,10 +108,38 @@ class StubCheckpoints:
 
     def __init__(self, events: list[Any]) -> None:
         self.events = events
+        self.saved_iterations: int | None = None
 
-    def save(self, name: str, progress: dict[str, Any]) -> Path:
-        self.events.append(("save", name, dict(progress)))
-        return Path(name)
+    def save(self, progress: Progress, logs: dict[str, int]) -> None:
+        self.events.append(("save", progress))
+        self.saved_iterations = progress.iterations
+
+
+class StubGuard:
+    """Notes when it looks."""
+
+    def __init__(self, events: list[Any], fail_in: int | None = None) -> None:
+        self.events = events
+        self.fail_in = fail_in
+
+    def start_iteration(self, iteration: int) -> None:
+        self.iteration = iteration
+
+    def check_episodes(self, episodes: TensorDictBase) -> None:
+        self.events.append("check episodes")
+
+    def end_iteration(self) -> None:
+        self.events.append("check updates")
+        if self.iteration == self.fail_in:
+            raise TrainingError("it is NaN")
+
+
+class StubLock:
+    def __init__(self, events: list[Any]) -> None:
+        self.events = events
+
+    def close(self) -> None:
+        self.events.append("lock open")
 
 
 def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
@@ -127,17 +158,22 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
         "validate_every": 1,
         "checkpoint_every": 100,
         "interrupt_in": None,
+        "fail_in": None,
+        "progress": Progress(),
     } | changes
     return Trainer(
         schedule=Schedule(**schedule | changes.get("schedule", {})),
+        progress=parts["progress"],
         collector=Collector(events),  # type: ignore[arg-type]
         set_iteration=lambda iteration: events.append(("iteration", iteration)),
         learner=StubLearner(events, parts["interrupt_in"]),
+        guard=StubGuard(events, parts["fail_in"]),  # type: ignore[arg-type]
         validate=StubValidation(events, parts["scores"]),  # type: ignore[arg-type]
         validate_every=parts["validate_every"],
         checkpoints=StubCheckpoints(events),  # type: ignore[arg-type]
         checkpoint_every=parts["checkpoint_every"],
         log=RunLog(folder, []),
+        lock=StubLock(events),  # type: ignore[arg-type]
         context_key="risk",
     )
 
@@ -151,22 +187,38 @@ def test_an_iteration_collects_stores_updates_validates_and_saves_in_this_order(
     stub_trainer(tmp_path, events, schedule={"iterations": 1}).run()
     names = [event if isinstance(event, str) else event[0] for event in events]
     assert names == [
-        *("iteration", "collect", "store", "update", "validate", "save", "save"),
-        *("collector closed", "validation closed"),
+        *("save", "iteration", "collect", "check episodes", "store", "update", "check updates", "validate", "save"),
+        *("collector closed", "validation closed", "lock open"),
     ]
 
 
 def test_steps_and_updates_are_counted(tmp_path: Path) -> None:
     events: list[Any] = []
-    trainer = stub_trainer(tmp_path, events, checkpoint_every=2)
+    trainer = stub_trainer(tmp_path, events, checkpoint_every=2, validate_every=100, scores=[-1.0])
     trainer.run()
-    assert (trainer.steps, trainer.updates) == (5 * 2 * 4, 5 * 3)
-    saved = [event[2] for event in kinds(events, "save") if event[1] == "last"]
-    assert [(progress["iteration"], progress["steps"], progress["updates"]) for progress in saved] == [
-        (1, 16, 6),
-        (3, 32, 12),
-        (4, 40, 15),
+    assert (trainer.progress.steps, trainer.progress.updates) == (5 * 2 * 4, 5 * 3)
+    saved = [event[1] for event in kinds(events, "save")]
+    assert [(progress.iterations, progress.steps, progress.updates) for progress in saved] == [
+        (0, 0, 0),
+        (2, 16, 6),
+        (4, 32, 12),
+        (5, 40, 15),
     ]
+    assert 0 < saved[1].elapsed_s < saved[2].elapsed_s
+
+
+def test_a_run_goes_on_from_its_progress(tmp_path: Path) -> None:
+    events: list[Any] = []
+    done = Progress(iterations=3, steps=24, updates=9, elapsed_s=1000.0, best_score=5.0, best_iterations=2)
+    trainer = stub_trainer(tmp_path, events, progress=done, scores=[5.0, 6.0])
+    trainer.checkpoints.saved_iterations = 3
+    trainer.run()
+    assert [event[1] for event in kinds(events, "iteration")] == [3, 4]
+    assert [event[2:] for event in kinds(events, "update")] == [(1.0, 0.75), (1.0, 0.5)]
+    # The fourth iteration's score is not above the best one's, the fifth's is.
+    progress = kinds(events, "save")[-1][1]
+    assert progress.elapsed_s > 1000.0
+    assert replace(progress, elapsed_s=0.0) == Progress(5, 40, 15, 0.0, 6.0, 5)
 
 
 def test_each_iteration_is_told_before_its_episodes_and_its_updates_get_its_strength(tmp_path: Path) -> None:
@@ -192,24 +244,34 @@ def test_best_is_the_highest_validation_score(tmp_path: Path) -> None:
     events: list[Any] = []
     trainer = stub_trainer(tmp_path, events, scores=[-50.0, -20.0, -30.0, -20.0, -10.0])
     trainer.run()
-    best = [event[2] for event in kinds(events, "save") if event[1] == "best"]
-    # An equal score is no better: the earlier agent stays.
-    assert [progress["iteration"] for progress in best] == [0, 1, 4]
-    assert [progress["best_score"] for progress in best] == [-50.0, -20.0, -10.0]
-    assert trainer.best_score == -10.0
+    saved = [event[1] for event in kinds(events, "save")][1:]
+    # An equal score is no better: the earlier agent stays. Every best one is saved, and after the last iteration.
+    assert [(progress.iterations, progress.best_iterations, progress.best_score) for progress in saved] == [
+        (1, 1, -50.0),
+        (2, 2, -20.0),
+        (5, 5, -10.0),
+    ]
 
 
-def test_ctrl_c_saves_the_last_agent_and_closes_everything(tmp_path: Path) -> None:
+def test_ctrl_c_drops_the_iteration_and_closes_everything(tmp_path: Path) -> None:
     events: list[Any] = []
-    trainer = stub_trainer(tmp_path, events, interrupt_in=2, validate_every=100)
+    trainer = stub_trainer(tmp_path, events, interrupt_in=2, validate_every=100, checkpoint_every=1)
     with pytest.raises(KeyboardInterrupt):
         trainer.run()
-    assert kinds(events, "save") == [
-        ("save", "last", {"iteration": 2, "steps": 24, "updates": 6, "best_score": -math.inf})
-    ]
-    assert events[-2:] == ["collector closed", "validation closed"]
-    assert "interrupted in iteration 2: save and stop" in (tmp_path / "train.log").read_text()
-    assert len(pd.read_csv(tmp_path / "training_episodes.csv")) == 3 * 2
+    assert [event[1].iterations for event in kinds(events, "save")] == [0, 1, 2]
+    assert events[-3:] == ["collector closed", "validation closed", "lock open"]
+    told = f"interrupted in iteration 2; 2 are saved, resume={tmp_path} continues there"
+    assert told in (tmp_path / "train.log").read_text().splitlines()
+
+
+def test_what_is_not_finite_ends_a_run_before_it_is_saved(tmp_path: Path) -> None:
+    events: list[Any] = []
+    trainer = stub_trainer(tmp_path, events, fail_in=2, checkpoint_every=1)
+    with pytest.raises(TrainingError, match="it is NaN"):
+        trainer.run()
+    assert [event[1].iterations for event in kinds(events, "save")] == [0, 1, 2]
+    assert events[-3:] == ["collector closed", "validation closed", "lock open"]
+    assert (tmp_path / "train.log").read_text().splitlines()[-1] == "it is NaN"
 
 
 def test_training_episodes_stand_under_the_updates_they_were_driven_with(tmp_path: Path) -> None:
@@ -541,15 +603,16 @@ def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: P
     trainer.collector.shutdown()
     trainer.validate.close()
     trainer.log.close()
+    trainer.lock.close()
 
 
 def test_progress_is_saved_with_the_weights(tiny_run: Path) -> None:
-    progress = load_manifest(tiny_run / "checkpoints", "last")
-    assert progress["iteration"] == ITERATIONS - 1
-    assert progress["steps"] == ITERATIONS * AGENTS * STEPS
-    assert progress["updates"] == ITERATIONS * UPDATES
+    progress = load_progress(tiny_run / "checkpoints", "last")
+    assert progress.iterations == ITERATIONS
+    assert progress.steps == ITERATIONS * AGENTS * STEPS
+    assert progress.updates == ITERATIONS * UPDATES
     validation = pd.read_csv(tiny_run / "validation_episodes.csv")
     validation["score"] = validation["reward"] - STEPS * validation["contact_fraction"]
     scores = validation.groupby("iteration")["score"].mean()
-    assert progress["best_score"] == pytest.approx(scores.max(), rel=1e-4)
-    assert load_manifest(tiny_run / "checkpoints", "best")["iteration"] == scores.idxmax()
+    assert progress.best_score == pytest.approx(scores.max(), rel=1e-4)
+    assert load_progress(tiny_run / "checkpoints", "best").iterations == scores.idxmax() + 1
