@@ -378,6 +378,7 @@ def test_a_validation_repeats_itself_and_follows_the_agent(tmp_path: Path) -> No
     trainer.validate.close()  # once more does no harm
     trainer.collector.shutdown()
     trainer.log.close()
+    trainer.lock.close()
 
 
 def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from rcdsac_trl import train
 from rcdsac_trl.errors import TrainingError
+from rcdsac_trl.pipeline import build
 from rcdsac_trl.pipeline.build.agent import make_loss
 from rcdsac_trl.pipeline.guard import load_failure
 from rcdsac_trl.pipeline.saved import load_progress
@@ -53,8 +54,7 @@ def test_an_update_that_is_not_finite_ends_the_run_and_is_shown_again(
     assert all(p.isfinite().all() for p in trainer.learner.loss.parameters())
     assert load_progress(tmp_path / "run" / "checkpoints", "last").iterations == 1
 
-    loss = make_loss(tiny_settings(), "cpu")
-    batch = load_failure(dump, loss)
+    loss, batch = build.failure(dump)
     assert batch.batch_size == torch.Size([2, 5])
     again = loss(batch)
     seen = trainer.guard._losses
@@ -94,8 +94,6 @@ def test_an_episode_that_is_not_finite_is_never_stored(tmp_path: Path, key: str 
 
 
 def test_the_same_failure_again_leaves_the_dump_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rcdsac_trl.pipeline import build
-
     run = tmp_path / "run"
     trainer = tiny_trainer(run)
     spoil_rewards(trainer, monkeypatch, math.nan, update=3)

@@ -102,7 +102,12 @@ class FiniteGuard:
             Checkpoint(loss=self.loss).save(temporary / _WEIGHTS)
             tensors = {_name(key): value.contiguous().clone() for key, value in batch.items(True, True)}
             (temporary / _BATCH).write_bytes(safetensors.torch.save(tensors))
-            described = {"not finite": what, "iteration": self._iteration, "batch_size": list(batch.batch_size)}
+            described = {
+                "not_finite": what,
+                "iteration": self._iteration,
+                "batch_size": list(batch.batch_size),
+                "distortion_strength": self.loss.distortion_strength,
+            }
             (temporary / "failure.json").write_text(json.dumps(described, indent=2) + "\n")
             durable.publish(folder)
         raise TrainingError(
@@ -112,7 +117,7 @@ class FiniteGuard:
 
 
 def load_failure(folder: Path, loss: LossModule) -> TensorDict:
-    """Load a dump: weights and the generator's state into a loss of the same run, and return the batch.
+    """Load a dump: weights, schedule and the generator's state into a loss of the same run, and return the batch.
 
     Args:
         folder: below ``failure/`` of a run folder.
@@ -120,8 +125,10 @@ def load_failure(folder: Path, loss: LossModule) -> TensorDict:
     """
     Checkpoint(loss=loss).load(folder / _WEIGHTS, map_location="cpu")
     tensors = safetensors.torch.load_file(folder / _BATCH)
-    batch_size = json.loads((folder / "failure.json").read_text())["batch_size"]
-    return TensorDict({tuple(name.split(".")): value for name, value in tensors.items()}, batch_size=batch_size)
+    described = json.loads((folder / "failure.json").read_text())
+    loss.distortion_strength = described["distortion_strength"]
+    keyed = {tuple(name.split(".")): value for name, value in tensors.items()}
+    return TensorDict(keyed, batch_size=described["batch_size"])
 
 
 def _name(key: str | tuple[str, ...]) -> str:

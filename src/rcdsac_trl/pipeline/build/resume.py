@@ -72,9 +72,7 @@ def _is_finished(folder: Path) -> bool:
 
 def _check_overrides(folder: Path, overrides: list[str]) -> None:
     """Refuse what would make the run another one; what it was started with, and what changes nothing, may stand."""
-    recorded = folder / ".hydra" / "overrides.yaml"
-    own = yaml.safe_load(recorded.read_text()) if recorded.is_file() else []
-    own = [override for override in own if _key(override) != "resume"]
+    own = _own_overrides(folder)
     for override in overrides:
         key = _key(override)
         if override in own or key == "resume":
@@ -86,6 +84,15 @@ def _check_overrides(folder: Path, overrides: list[str]) -> None:
                 f"{override} is not what {folder} was started with, and resume continues a run as it was: leave it "
                 "out, or start a new run without resume"
             )
+
+
+def _own_overrides(folder: Path) -> list[str]:
+    """Read what Hydra noted of the call that started a run; nothing if that is not there any more."""
+    try:
+        noted = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text())
+    except (OSError, yaml.YAMLError):
+        return []
+    return [override for override in noted or [] if _key(override) != "resume"]
 
 
 def _changes(own: list[str], override: str) -> bool:

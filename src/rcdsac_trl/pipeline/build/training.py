@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
@@ -26,7 +27,7 @@ from rcdsac_trl.pipeline.build.world import environment, evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.evaluation import Validation
-from rcdsac_trl.pipeline.guard import FiniteGuard
+from rcdsac_trl.pipeline.guard import FiniteGuard, load_failure
 from rcdsac_trl.pipeline.policies import CollectionPolicy
 from rcdsac_trl.pipeline.replay import SequenceReplay
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
@@ -99,6 +100,18 @@ def resumed(folder: Path) -> Trainer | None:
     except BaseException:
         lock.close()
         raise
+
+
+def failure(dump: Path) -> tuple[LossModule, TensorDict]:
+    """Make what shows a NaN or an infinity again: called with the batch, the loss returns what it returned then.
+
+    Args:
+        dump: a folder below ``failure/`` of a run folder.
+    """
+    settings = settings_of_run(dump.parents[1])
+    loss = make_loss(settings, "cpu")
+    SoftUpdate(loss, tau=settings.learner.target_coefficient)  # TorchRL warns of targets that nothing moves
+    return loss, load_failure(dump, loss)
 
 
 def has_begun(folder: Path) -> bool:
