@@ -1,6 +1,7 @@
 """Checkpoints: everything comes back exactly, without a pickle; damage is named and the last good one is used."""
 
 import json
+import os
 import pickle
 import shutil
 from collections.abc import Callable
@@ -173,6 +174,38 @@ def test_what_an_interruption_left_is_cleared_and_never_read(tmp_path: Path) -> 
     assert newest(tmp_path)[0].progress.iterations == 1
     checkpoints.save(progress(2), {})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["iteration-000001", "iteration-000002"]
+
+
+def test_everything_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    done: list[tuple[str, Path]] = []
+    fsync, rename = os.fsync, os.rename
+
+    def noted_fsync(descriptor: int) -> None:
+        done.append(("sync", Path(os.readlink(f"/proc/self/fd/{descriptor}"))))
+        fsync(descriptor)
+
+    def noted_rename(old: Path, new: Path) -> None:
+        done.append(("rename", Path(new)))
+        rename(old, new)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(os, "rename", noted_rename)
+    folder = three_checkpoints(run)
+    for checkpoint in folders(folder):
+        named = done.index(("rename", checkpoint))
+        temporary = checkpoint.with_name(f".unfinished-{checkpoint.name}")
+        inside = list(checkpoint.rglob("*"))
+        assert len(inside) > 4
+        for path in inside:
+            assert ("sync", temporary / path.relative_to(checkpoint)) in done[:named], path
+        assert ("sync", temporary) in done[:named]
+        assert ("sync", folder) in done[named:]
+        # What a checkpoint names is there before it is.
+        for segment in newest(folder)[0].segments[: int(checkpoint.name[-1])]:
+            path = run / "replay" / segment.file
+            assert ("sync", path.with_name(f".unfinished-{path.name}")) in done[: done.index(("rename", path))]
+            assert done.index(("rename", path)) < named
 
 
 def test_restoring_forgets_what_came_after(tmp_path: Path) -> None:

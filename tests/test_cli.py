@@ -305,13 +305,13 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
 
 
 def interrupt(folder: Path, *arguments: str) -> tuple[int, str]:
-    """Train without end, press Ctrl-C after the first iteration; return the exit code and stderr."""
+    """Train without end, press Ctrl-C after the second iteration; return the exit code and stderr."""
     endless = [*TINY, "schedule.iterations=100000", "validation.every_iterations=100000", *arguments]
     process = start(folder, "rcdsac_trl.train", POW, *endless, f"hydra.run.dir={folder / 'run'}")
     log = folder / "run" / "train.log"
     deadline = time.monotonic() + 120
     while process.poll() is None and time.monotonic() < deadline:
-        if log.exists() and "1/100000" in log.read_text():
+        if log.exists() and "   2/100000" in log.read_text():  # the first one is saved then
             break
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the whole group, workers included

@@ -56,6 +56,9 @@ def test_an_update_that_is_not_finite_ends_the_run_and_is_shown_again(
 
     loss, batch = build.failure(dump)
     assert batch.batch_size == torch.Size([2, 5])
+    assert {key: value.stride(1) == 0 for key, value in batch.items(True, True)} == {
+        key: value.stride(1) == 0 for key, value in trainer.guard._batch.items(True, True)
+    }
     again = loss(batch)
     seen = trainer.guard._losses
     for key in ("loss_qvalue", "loss_actor", "loss_alpha"):

@@ -100,7 +100,7 @@ class FiniteGuard:
             durable.clear_leftovers(self.folder)
             temporary = durable.unfinished(folder)
             Checkpoint(loss=self.loss).save(temporary / _WEIGHTS)
-            tensors = {_name(key): value.contiguous().clone() for key, value in batch.items(True, True)}
+            tensors = {_name(key): _unexpanded(value) for key, value in batch.items(True, True)}
             (temporary / _BATCH).write_bytes(safetensors.torch.save(tensors))
             described = {
                 "not_finite": what,
@@ -127,8 +127,14 @@ def load_failure(folder: Path, loss: LossModule) -> TensorDict:
     tensors = safetensors.torch.load_file(folder / _BATCH)
     described = json.loads((folder / "failure.json").read_text())
     loss.distortion_strength = described["distortion_strength"]
-    keyed = {tuple(name.split(".")): value for name, value in tensors.items()}
-    return TensorDict(keyed, batch_size=described["batch_size"])
+    size = described["batch_size"]
+    keyed = {tuple(name.split(".")): value.expand(*size, *value.shape[len(size) :]) for name, value in tensors.items()}
+    return TensorDict(keyed, batch_size=size)
+
+
+def _unexpanded(value: Tensor) -> Tensor:
+    """Copy ``[B, T, ..]``, but keep one entry of a time along which it is expanded: a loss may tell the two apart."""
+    return (value[:, :1] if value.stride(1) == 0 else value).clone(memory_format=torch.contiguous_format)
 
 
 def _name(key: str | tuple[str, ...]) -> str:
