@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world import task as rules
 from rcdsac_trl.world.episode import NavigationAgent
-from rcdsac_trl.world.lidar import NUM_BINS, sensor_mask
+from rcdsac_trl.world.lidar import sensor_mask
 from rcdsac_trl.world.maps import SPLITS, MapSettings, Split
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES, Buffers
@@ -73,7 +73,6 @@ class AgentGroup:
         ]
         self._mask = mask
         self._first_episode = _not_negative("first_episode", first_episode)
-        self._distances = np.full((len(agent_ids), NUM_BINS), np.inf)
         self.buffers = Buffers.zeros(len(agent_ids))
         self.set_seed(seed)
 
@@ -88,15 +87,13 @@ class AgentGroup:
 
     def reset(self, rows: Iterable[int], episode: int | None = None) -> None:
         """Begin an episode of some agents: their next one, or the given one, from which they count on."""
-        buffers = self.buffers
-        for row in rows:
+        begun = list(rows)
+        for row in begun:
             number = self._next_episodes[row] if episode is None else _not_negative("episode", episode)
             self._agents[row].reset(self._seed, number)
             self._next_episodes[row] = number + 1
-            buffers.reward_components[row] = 0.0
-            buffers.reward[row] = 0.0
-            self._collect(row)
-        self._see()
+        self.buffers.reward[begun] = 0.0
+        self._collect(begun)
 
     def step(self, actions: NDArray, collision_weights: NDArray | None = None) -> None:
         """Take one agent step with every agent.
@@ -110,12 +107,11 @@ class AgentGroup:
             UserInputError: an action is not a number in [-1, 1], or an agent was never reset.
         """
         buffers = self.buffers
-        for row, (agent, action) in enumerate(zip(self._agents, self._checked(actions), strict=True)):
-            buffers.reward_components[row] = agent.step(action)
-            self._collect(row)
+        for agent, action in zip(self._agents, self._checked(actions), strict=True):
+            agent.step(action)
+        self._collect(range(len(self)))
         weights = 1.0 if collision_weights is None else collision_weights
         buffers.reward[:, 0] = rules.total_reward(buffers.reward_components, weights)
-        self._see()
 
     def scene(self, row: int) -> Scene:
         """Return what a picture of one agent shows."""
@@ -136,21 +132,22 @@ class AgentGroup:
         values: list[list[float]] = actions.tolist()
         return values
 
-    def _collect(self, row: int) -> None:
-        agent, buffers = self._agents[row], self.buffers
-        buffers.pose[row] = agent.pose
-        buffers.waypoint[row] = rules.waypoint_observation(agent.pose, *agent.next_waypoints)
-        buffers.velocity[row] = rules.velocity_observation(*agent.velocities)
-        buffers.contact[row, 0] = agent.in_contact
-        buffers.goal_reached[row, 0] = agent.goal_reached
-        self._distances[row] = agent.distances_m
-
-    def _see(self) -> None:
-        """Write what is cheaper for all agents at once than for each: ranges, and the limits of velocities."""
-        buffers = self.buffers
-        buffers.range[:] = rules.range_observation(self._distances, self._mask)
+    def _collect(self, rows: Sequence[int]) -> None:
+        """Write what some agents found: one array operation a key for all of them, not one for each."""
+        if not rows:
+            return
+        buffers, agents = self.buffers, [self._agents[row] for row in rows]
+        at = slice(None) if len(rows) == len(self) else rows
+        distances = np.array([agent.distances_m for agent in agents])
+        buffers.range[at] = rules.range_observation(distances, self._mask)
+        buffers.waypoint[at] = [rules.waypoint_observation(agent.pose, *agent.next_waypoints) for agent in agents]
+        velocities = np.array([agent.velocities for agent in agents], dtype=np.float32)
         limits = SPACES["velocity"]
-        np.clip(buffers.velocity, limits.low, limits.high, out=buffers.velocity)
+        buffers.velocity[at] = np.minimum(np.maximum(velocities, limits.low), limits.high)
+        buffers.pose[at] = [agent.pose for agent in agents]
+        buffers.contact[at, 0] = [agent.in_contact for agent in agents]
+        buffers.goal_reached[at, 0] = [agent.goal_reached for agent in agents]
+        buffers.reward_components[at] = [agent.reward_components for agent in agents]
 
 
 def _not_negative(name: str, value: int) -> int:

@@ -21,7 +21,7 @@ from rcdsac_trl.world.planner import Planner
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.shapes import Map
 from rcdsac_trl.world.simulation import Simulation
-from rcdsac_trl.world.task import TaskSettings
+from rcdsac_trl.world.task import Point, TaskSettings
 
 Pose = tuple[float, float, float]
 
@@ -57,7 +57,22 @@ class NavigationAgent:
         split: which of the disjoint map sets.
         agent_id: the agent's global number, which its random streams derive from.
         gui: show PyBullet's window.
+
+    Attributes:
+        pose: x, y in m and yaw in rad, map frame.
+        velocities: measured linear and angular velocity, then the desired ones, m/s and rad/s: o_velocity.
+        in_contact: whether the robot touched anything in the last step.
+        goal_reached: whether it reached its goal in the last step.
+        reward_components: of the last step, see :func:`rcdsac_trl.world.task.reward_components`; zeros after a reset.
+        distances_m: what the range sensor measures, float64 [180], m.
     """
+
+    pose: Pose
+    velocities: tuple[float, float, float, float]
+    in_contact: bool
+    goal_reached: bool
+    reward_components: tuple[float, float, float, float, float]
+    distances_m: NDArray[np.float64]
 
     def __init__(
         self,
@@ -83,7 +98,7 @@ class NavigationAgent:
         self._map, self._planner = load_map(self._map_settings, self._split, seed, episode)
         rng = self._stream("start")
         x, y = self._planner.sample_free(rng).tolist()
-        self.pose: Pose = (x, y, rng.uniform(-math.pi, math.pi))
+        self.pose = (x, y, rng.uniform(-math.pi, math.pi))
         self._motor_steps = int(self._stream("motor_steps").choice(self._task.motor_steps))
         if self._simulation is None:
             self._simulation = Simulation(gui=self._gui)
@@ -91,15 +106,16 @@ class NavigationAgent:
         self._noise = self._stream("noise")
         self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._task.action_delay_steps)
         self._goals_drawn = 0
-        self._goal = np.array([x, y])
+        self._goal = x, y
         self._draw_goal()
         self._trail.clear()
         self.in_contact = self.goal_reached = False
         self.velocities = (0.0, 0.0, 0.0, 0.0)
+        self.reward_components = (0.0, 0.0, 0.0, 0.0, 0.0)
         self._sense()
 
-    def step(self, action: Sequence[float]) -> NDArray[np.float32]:
-        """Take one agent step and return the reward's components, float32 [5]."""
+    def step(self, action: Sequence[float]) -> None:
+        """Take one agent step."""
         simulation, task = self._require_simulation(), self._task
         v_u, omega_u = rules.desired_velocities(action)
         self._delayed.append((v_u, omega_u))
@@ -110,7 +126,9 @@ class NavigationAgent:
         # The step is paid for progress to the waypoint that was next while it was taken.
         _, bearing = rules.distance_and_bearing(self.pose, self._path[self._next])
         self.goal_reached = self._distance_to(self._goal) < task.goal_radius_m
-        components = rules.reward_components(moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached)
+        self.reward_components = rules.reward_components(
+            moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached
+        )
         if self.goal_reached:
             self._draw_goal()
         else:
@@ -118,11 +136,10 @@ class NavigationAgent:
         v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, task.odometry_noise_std, self._noise)
         self.velocities = (v_c, omega_c, v_u, omega_u)
         self._sense()
-        return components
 
     @property
-    def next_waypoints(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The next waypoint and the one after it, [2] each, m; on the last leg both are the goal."""
+    def next_waypoints(self) -> tuple[Point, Point]:
+        """The next waypoint and the one after it, m; on the last leg both are the goal."""
         return self._path[self._next], self._path[min(self._next + 1, len(self._path) - 1)]
 
     def scene(self) -> Scene:
@@ -133,7 +150,7 @@ class NavigationAgent:
             pose=self.pose,
             distances_m=self.distances_m,
             sensor_mask=self._mask,
-            waypoints=self._path[self._next :],
+            waypoints=np.array(self._path[self._next :]),
             movers=np.column_stack([simulation.mover_positions, simulation.mover_radii]),
             trail=tuple(self._trail),
             in_contact=self.in_contact,
@@ -157,8 +174,10 @@ class NavigationAgent:
         """Draw the next goal relative to the last one, and plan to it from where the robot is."""
         rng = self._stream("goal", self._goals_drawn)
         self._goals_drawn += 1
-        self._goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
-        self._path = self._planner.waypoints(self.pose[:2], self._goal)
+        goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
+        # As plain floats: single numbers out of arrays are slow, and every step reads some.
+        self._path = [(x, y) for x, y in self._planner.waypoints(self.pose[:2], goal).tolist()]
+        self._goal = self._path[-1]
         self._next = 0
         self._take_waypoints()
 
@@ -168,7 +187,7 @@ class NavigationAgent:
         while self._next < last and self._distance_to(self._path[self._next]) < self._task.waypoint_radius_m:
             self._next += 1
 
-    def _distance_to(self, point: Sequence[float] | NDArray[np.float64]) -> float:
+    def _distance_to(self, point: Point) -> float:
         return math.hypot(point[0] - self.pose[0], point[1] - self.pose[1])
 
     def _sense(self) -> None:

@@ -67,6 +67,8 @@ class Movers:
     Attributes:
         positions: float64 [k, 2], m.
         radii: float64 [k], m.
+        fastest_m_per_s: the fastest mover's top speed, 0 without movers.
+        notice_gap_m: gap to the robot beyond which no mover's walk depends on where the robot is.
     """
 
     def __init__(
@@ -80,6 +82,8 @@ class Movers:
         self.radii = np.array([mover.radius for mover in map.movers], dtype=np.float64)
         self._top_speeds = np.array([mover.speed_m_per_s for mover in map.movers], dtype=np.float64)
         self._period_s = period_s
+        self.fastest_m_per_s = float(self._top_speeds.max(initial=0.0))
+        self.notice_gap_m = _notice_gap(self.fastest_m_per_s, period_s)
         self.positions = np.zeros((len(self.radii), 2))
         self._state = np.zeros((len(self.radii), 4))
         self._state[:, _DIRECTION] = 1.0
@@ -89,26 +93,34 @@ class Movers:
         for number in range(len(self.radii)):
             self._place(number, robot_xy, rng)
 
-    def step(self, robot_x: float, robot_y: float) -> None:
-        """Move all movers by one period.
+    def step(self, robot_x: float, robot_y: float, periods: int = 1) -> float:
+        """Move all movers by some periods.
 
         Args:
             robot_x: where the robot is, m.
             robot_y: where the robot is, m.
+            periods: how many; the robot is taken to stand still meanwhile.
+
+        Returns:
+            The gap between the robot and the nearest mover afterwards, m, negative where they overlap; ``inf`` without
+            movers.
         """
-        if len(self.radii):
-            _step(
-                self._state,
-                self.positions,
-                self.radii,
-                self._top_speeds,
-                self._tours,
-                self._first_piece,
-                robot_x,
-                robot_y,
-                ROBOT_RADIUS_M,
-                self._period_s,
-            )
+        if not len(self.radii):
+            return math.inf
+        gap_m: float = _walk(
+            self._state,
+            self.positions,
+            self.radii,
+            self._top_speeds,
+            self._tours,
+            self._first_piece,
+            robot_x,
+            robot_y,
+            ROBOT_RADIUS_M,
+            self._period_s,
+            periods,
+        )
+        return gap_m
 
     def _place(self, number: int, robot_xy: tuple[float, float], rng: np.random.Generator) -> None:
         """Put a mover somewhere on its tour, away from the robot and from the movers placed before it."""
@@ -126,6 +138,12 @@ class Movers:
                 break
         self._state[number, _ALONG] = best
         self.positions[number] = _point_on(tour, 0, len(tour), best)[:2]
+
+
+def _notice_gap(top_speed: float, period_s: float) -> float:
+    """Return the gap that is too wide to slow a mover down, see :func:`_step`, and a centimetre for rounding."""
+    lost = _PROFILE_ACCELERATION * period_s
+    return STOP_GAP_M + ((top_speed + lost) ** 2 - lost**2) / (2.0 * _PROFILE_ACCELERATION) + 0.01
 
 
 def _tour_corners(planner: WalkPlanner, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -289,3 +307,27 @@ def _step(
         along = (along + direction * speed * period_s) % tours[last - 1, _END]
         state[k, _ALONG], state[k, _SPEED] = along, speed
         positions[k, 0], positions[k, 1], _ = _point_on(tours, first, last, along)
+
+
+@numba.njit(cache=True)
+def _walk(
+    state: np.ndarray,
+    positions: np.ndarray,
+    radii: np.ndarray,
+    top_speeds: np.ndarray,
+    tours: np.ndarray,
+    first_piece: np.ndarray,
+    robot_x: float,
+    robot_y: float,
+    robot_radius: float,
+    period_s: float,
+    periods: int,
+) -> float:
+    """Move all movers by some periods, in place; return the gap between the robot and the nearest one."""
+    for _ in range(periods):
+        _step(state, positions, radii, top_speeds, tours, first_piece, robot_x, robot_y, robot_radius, period_s)
+    gap = math.inf
+    for k in range(len(radii)):
+        distance = math.hypot(positions[k, 0] - robot_x, positions[k, 1] - robot_y)
+        gap = min(gap, distance - radii[k] - robot_radius)
+    return gap

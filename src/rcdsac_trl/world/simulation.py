@@ -19,7 +19,7 @@ from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import Box, Cylinder, Map
 from rcdsac_trl.world.movers import Movers, WalkPlanner
-from rcdsac_trl.world.task import MOTOR_PERIOD_S, clip_command
+from rcdsac_trl.world.task import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S, clip_command
 
 CONTACT_DISTANCE_M = 1e-3
 """The robot is in contact with what is nearer than this.
@@ -39,6 +39,9 @@ _ROBOT_INERTIA = (1e9, 1e9, 0.5 * _ROBOT_MASS_KG * ROBOT_RADIUS_M**2)
 # Movers farther than this from touching the robot are moved in PyBullet only once an agent step, in which
 # both together go at most 0.2 m.
 _MOVER_SYNC_GAP_M = 0.5
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+# Added to how far the robot and a mover can come nearer to each other, for what rounding and contact add.
+_SLACK_M = 0.02
 
 
 class StepResult(NamedTuple):
@@ -90,6 +93,7 @@ class Simulation:
             raise UserInputError("PyBullet could not open its window: gui=true needs a display; use gui=false")
         self._pose = (0.0, 0.0, 0.0)
         self._v_c = self._omega_c = 0.0
+        self._clearance_m = 0.0
 
     def load(
         self,
@@ -119,7 +123,9 @@ class Simulation:
         pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
         self._build_static(map)
         self._build_robot(start_pose)
+        self._clearance_m = 0.0
         self._movers = Movers(map, planner, start_pose[:2], movers_rng, MOTOR_PERIOD_S)
+        self._mover_radii: list[float] = self._movers.radii.tolist()
         self._build_movers()
         self._segments = np.ascontiguousarray(map.segments(), dtype=np.float64)
         static = np.asarray(map.circles(), dtype=np.float64).reshape(-1, 3)
@@ -156,24 +162,35 @@ class Simulation:
         client, robot = self._client, self._robot
         x, y, yaw = self._pose
         v_c, omega_c = self._v_c, self._omega_c
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        gap_m = self._movers.step(x, y)
+        self._sync_movers(x, y, everywhere=True)
+        duration_s = motor_steps * MOTOR_PERIOD_S
+        robot_m = max(abs(v_c), MAX_LINEAR_VELOCITY) * duration_s
+        approach_m = robot_m + self._movers.fastest_m_per_s * duration_s + _SLACK_M
+        # Movers that cannot notice the robot in this agent step walk through it at once.
+        unnoticed = gap_m > max(self._movers.notice_gap_m, _MOVER_SYNC_GAP_M) + approach_m and not self._gui
+        if unnoticed:
+            self._movers.step(x, y, motor_steps - 1)
+        # Nothing is asked about contacts that cannot be.
         in_contact = False
+        look = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
+        self._clearance_m = 0.0  # not known until the next scan
         for motor_step in range(motor_steps):
-            self._movers.step(x, y)
-            self._sync_movers(x, y, everywhere=motor_step == 0 or self._gui)
+            if motor_step > 0 and not unnoticed:
+                self._movers.step(x, y)
+                self._sync_movers(x, y, everywhere=self._gui)
             v, omega = clip_command(v_u, omega_u, v_c, omega_c)
-            pybullet.resetBaseVelocity(
-                robot,
-                (v * math.cos(yaw), v * math.sin(yaw), 0.0),
-                (0.0, 0.0, omega),
-                physicsClientId=client,
-            )
-            pybullet.stepSimulation(physicsClientId=client)
-            (x, y, _), turn = pybullet.getBasePositionAndOrientation(robot, physicsClientId=client)
-            linear, angular = pybullet.getBaseVelocity(robot, physicsClientId=client)
+            # By position, which PyBullet reads faster than keywords.
+            pybullet.resetBaseVelocity(robot, (v * cos, v * sin, 0.0), (0.0, 0.0, omega), client)
+            pybullet.stepSimulation(client)
+            (x, y, _), turn = pybullet.getBasePositionAndOrientation(robot, client)
+            linear, angular = pybullet.getBaseVelocity(robot, client)
             yaw = 2.0 * math.atan2(turn[2], turn[3])
-            v_c = linear[0] * math.cos(yaw) + linear[1] * math.sin(yaw)
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            v_c = linear[0] * cos + linear[1] * sin
             omega_c = angular[2]
-            if not in_contact:
+            if look and not in_contact:
                 points = pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
                 in_contact = any(point[8] <= CONTACT_DISTANCE_M for point in points)
             if self._gui:
@@ -191,7 +208,9 @@ class Simulation:
         """
         self._mover_circles[:, :2] = self._movers.positions
         x, y, yaw = self._pose
-        return sector_distances(x, y, yaw, self._segments, self._circles)
+        distances = sector_distances(x, y, yaw, self._segments, self._circles)
+        self._clearance_m = float(distances.min())
+        return distances
 
     def close(self) -> None:
         """Disconnect from PyBullet; harmless when done before."""
@@ -273,12 +292,10 @@ class Simulation:
         """Tell PyBullet where the movers are: all of them, or only those that the robot could touch."""
         near = ROBOT_RADIUS_M + _MOVER_SYNC_GAP_M
         for body, (x, y), radius in zip(
-            self._mover_bodies, self._movers.positions.tolist(), self._movers.radii.tolist(), strict=True
+            self._mover_bodies, self._movers.positions.tolist(), self._mover_radii, strict=True
         ):
             if everywhere or math.hypot(x - robot_x, y - robot_y) < near + radius:
-                pybullet.resetBasePositionAndOrientation(
-                    body, (x, y, 0.0), (0.0, 0.0, 0.0, 1.0), physicsClientId=self._client
-                )
+                pybullet.resetBasePositionAndOrientation(body, (x, y, 0.0), _UPRIGHT, self._client)
 
     def _look_from_above(self, map: Map) -> None:
         """Point the window's camera down on the whole map."""
