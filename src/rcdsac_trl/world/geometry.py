@@ -25,6 +25,7 @@ CELL_M = 0.1
 ROBOT_RADIUS_M = 0.25
 """Circumradius of the octagonal robot, m."""
 
+_ROUNDING_M = 1e-9
 _SLACK = 1.03  # a little cost is given for fewer corners, else many lie a step or two apart
 
 
@@ -110,6 +111,60 @@ def segment_clearance(
 
 
 @numba.njit(cache=True)
+def _is_clear(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    boxes: NDArray[np.float64],
+    extents: NDArray[np.float64],
+    circles: NDArray[np.float64],
+    need_m: float,
+) -> bool:
+    """Return whether :func:`segment_clearance` is ``need_m``, and stop at the first shape that is nearer.
+
+    ``extents`` are the half sides of the boxes' bounding boxes, see :func:`_bounding_boxes`: most shapes are out of
+    reach, which four comparisons show.
+    """
+    reach = need_m + _ROUNDING_M
+    low_x, high_x = min(ax, bx) - reach, max(ax, bx) + reach
+    low_y, high_y = min(ay, by) - reach, max(ay, by) + reach
+    for i in range(boxes.shape[0]):
+        x, y = boxes[i, 0], boxes[i, 1]
+        ex, ey = extents[i, 0], extents[i, 1]
+        if x + ex < low_x or x - ex > high_x or y + ey < low_y or y - ey > high_y:
+            continue
+        hx, hy, cos, sin = boxes[i, 2], boxes[i, 3], boxes[i, 4], boxes[i, 5]
+        if _point_segment(x, y, ax, ay, bx, by) - math.sqrt(hx * hx + hy * hy) >= need_m:
+            continue
+        ux, uy = ax - x, ay - y
+        vx, vy = bx - x, by - y
+        if (
+            _segment_box(cos * ux + sin * uy, cos * uy - sin * ux, cos * vx + sin * vy, cos * vy - sin * vx, hx, hy)
+            < need_m
+        ):
+            return False
+    for i in range(circles.shape[0]):
+        x, y, radius = circles[i]
+        if x + radius < low_x or x - radius > high_x or y + radius < low_y or y - radius > high_y:
+            continue
+        if max(_point_segment(x, y, ax, ay, bx, by) - radius, 0.0) < need_m:
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def _bounding_boxes(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return half the sides [n, 2] of the axis-parallel boxes around boxes [n, 6]."""
+    extents = np.empty((boxes.shape[0], 2))
+    for i in range(boxes.shape[0]):
+        hx, hy, cos, sin = boxes[i, 2], boxes[i, 3], abs(boxes[i, 4]), abs(boxes[i, 5])
+        extents[i, 0] = cos * hx + sin * hy
+        extents[i, 1] = sin * hx + cos * hy
+    return extents
+
+
+@numba.njit(cache=True)
 def lower_clearance(
     clearance: NDArray[np.float64],
     boxes: NDArray[np.float64],
@@ -177,6 +232,7 @@ def pull_tight(
     ``points[0]``, which is not among the returned ones.
     """
     count = points.shape[0]
+    extents = _bounding_boxes(boxes)
     cost = np.zeros(count)
     for i in range(1, count):
         ax, ay = points[i - 1]
@@ -192,9 +248,8 @@ def pull_tight(
         while nxt > at + 1:
             bx, by = points[nxt]
             allowed = _SLACK * (cost[nxt] - cost[at])
-            if (
-                _leg_cost(ax, ay, bx, by, weight, cell_m) <= allowed
-                and segment_clearance(ax, ay, bx, by, boxes, circles, need) >= need
+            if _leg_cost(ax, ay, bx, by, weight, cell_m) <= allowed and _is_clear(
+                ax, ay, bx, by, boxes, extents, circles, need
             ):
                 break
             nxt -= 1

@@ -18,15 +18,22 @@ _SQRT2 = math.sqrt(2.0)
 def nearest_cell(free: NDArray[np.bool_], x: float, y: float, cell_m: float) -> int:
     """Return the flat index of the free cell whose centre is nearest to a point, -1 when none is free."""
     rows, columns = free.shape
-    best, nearest = np.inf, -1
-    for row in range(rows):
-        dy = (row + 0.5) * cell_m - y
-        for column in range(columns):
-            dx = (column + 0.5) * cell_m - x
-            if free[row, column] and dx * dx + dy * dy < best:
-                best = dx * dx + dy * dy
-                nearest = row * columns + column
-    return nearest
+    at_row = min(max(int(y / cell_m), 0), rows - 1)
+    at_column = min(max(int(x / cell_m), 0), columns - 1)
+    reach = 2
+    while True:
+        best, nearest = np.inf, -1
+        for row in range(max(at_row - reach, 0), min(at_row + reach + 1, rows)):
+            dy = (row + 0.5) * cell_m - y
+            for column in range(max(at_column - reach, 0), min(at_column + reach + 1, columns)):
+                dx = (column + 0.5) * cell_m - x
+                if free[row, column] and dx * dx + dy * dy < best:
+                    best = dx * dx + dy * dy
+                    nearest = row * columns + column
+        # Whatever lies outside the window is farther away than this (from a point on the grid).
+        if best < (reach * cell_m) ** 2 or reach >= max(rows, columns):
+            return nearest
+        reach *= 4
 
 
 @numba.njit(cache=True)
@@ -119,41 +126,48 @@ def cheapest_path(free: NDArray[np.bool_], weight: NDArray[np.float64], start: i
     goal_row, goal_column = goal // columns, goal % columns
     cost = np.full(rows * columns, np.inf)
     parent = np.full(rows * columns, -1, np.int32)
-    closed = np.zeros(rows * columns, np.bool_)
+    # Inside a border that is closed from the beginning, no neighbour needs to be asked whether it exists.
+    closed = np.ones((rows + 2, columns + 2), np.bool_)
+    closed[1:-1, 1:-1] = ~free
     # A cell enters the open heap at most once for each of its 8 neighbours, in practice far less often.
     heap_costs = np.empty(rows * columns, np.float64)
     heap_nodes = np.empty(rows * columns, np.int32)
     cost[start] = 0.0
+    closed[start // columns + 1, start % columns + 1] = False
     _push(heap_costs, heap_nodes, 0, 0.0, start)
     size = 1
+    found = False
     while size > 0:
         node = _pop(heap_costs, heap_nodes, size)
         size -= 1
-        if closed[node]:
+        row, column = node // columns, node % columns
+        if closed[row + 1, column + 1]:
             continue
-        closed[node] = True
+        closed[row + 1, column + 1] = True
         if node == goal:
+            found = True
             break
         if size + 8 > heap_costs.size:
             heap_costs = np.concatenate((heap_costs, np.empty_like(heap_costs)))
             heap_nodes = np.concatenate((heap_nodes, np.empty_like(heap_nodes)))
-        row, column = node // columns, node % columns
-        for r in range(max(row - 1, 0), min(row + 2, rows)):
-            for c in range(max(column - 1, 0), min(column + 2, columns)):
-                other = r * columns + c
-                if not free[r, c] or closed[other]:
+        here, here_weight = cost[node], weight[row, column]
+        for dr in (-1, 0, 1):
+            for dc in (-1, 0, 1):
+                if closed[row + 1 + dr, column + 1 + dc]:
                     continue
-                step = _SQRT2 if r != row and c != column else 1.0
-                new_cost = cost[node] + step * 0.5 * (weight[row, column] + weight[r, c])
+                r, c = row + dr, column + dc
+                other = node + dr * columns + dc
+                step = _SQRT2 if dr != 0 and dc != 0 else 1.0
+                new_cost = here + step * 0.5 * (here_weight + weight[r, c])
                 if new_cost < cost[other]:
                     cost[other] = new_cost
                     parent[other] = node
-                    dr, dc = abs(r - goal_row), abs(c - goal_column)
-                    heuristic = max(dr, dc) + (_SQRT2 - 1.0) * min(dr, dc)
+                    to_row, to_column = abs(r - goal_row), abs(c - goal_column)
+                    heuristic = max(to_row, to_column) + (_SQRT2 - 1.0) * min(to_row, to_column)
                     _push(heap_costs, heap_nodes, size, new_cost + heuristic, other)
                     size += 1
     length = 0
-    node = goal if closed[goal] else -1
+    node = goal if found else -1
     while node >= 0:
         length += 1
         node = parent[node]
