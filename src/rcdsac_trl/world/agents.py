@@ -140,14 +140,27 @@ class AgentGroup:
         at = slice(None) if len(rows) == len(self) else rows
         distances = np.array([agent.distances_m for agent in agents])
         buffers.range[at] = rules.range_observation(distances, self._mask)
-        buffers.waypoint[at] = [rules.waypoint_observation(agent.pose, *agent.next_waypoints) for agent in agents]
-        velocities = np.array([agent.velocities for agent in agents], dtype=np.float32)
+        numbers = np.array(
+            [
+                (
+                    *rules.waypoint_observation(agent.pose, *agent.next_waypoints),
+                    *agent.velocities,
+                    *agent.pose,
+                    *agent.reward_components,
+                    agent.in_contact,
+                    agent.goal_reached,
+                )
+                for agent in agents
+            ],
+            dtype=np.float32,
+        )
         limits = SPACES["velocity"]
-        buffers.velocity[at] = np.minimum(np.maximum(velocities, limits.low), limits.high)
-        buffers.pose[at] = [agent.pose for agent in agents]
-        buffers.contact[at, 0] = [agent.in_contact for agent in agents]
-        buffers.goal_reached[at, 0] = [agent.goal_reached for agent in agents]
-        buffers.reward_components[at] = [agent.reward_components for agent in agents]
+        buffers.waypoint[at] = numbers[:, :6]
+        buffers.velocity[at] = np.minimum(np.maximum(numbers[:, 6:10], limits.low), limits.high)
+        buffers.pose[at] = numbers[:, 10:13]
+        buffers.reward_components[at] = numbers[:, 13:18]
+        buffers.contact[at] = numbers[:, 18:19]
+        buffers.goal_reached[at] = numbers[:, 19:20]
 
 
 def _not_negative(name: str, value: int) -> int:

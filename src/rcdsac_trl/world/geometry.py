@@ -248,8 +248,9 @@ def pull_tight(
         while nxt > at + 1:
             bx, by = points[nxt]
             allowed = _SLACK * (cost[nxt] - cost[at])
-            if _leg_cost(ax, ay, bx, by, weight, cell_m) <= allowed and _is_clear(
-                ax, ay, bx, by, boxes, extents, circles, need
+            if (
+                _is_clear(ax, ay, bx, by, boxes, extents, circles, need)
+                and _leg_cost(ax, ay, bx, by, weight, cell_m) <= allowed
             ):
                 break
             nxt -= 1

@@ -149,6 +149,47 @@ def _lower_to_ray(out: np.ndarray, bin_: int, border: int, cx: float, cy: float,
 
 
 @numba.njit(cache=True)
+def scan(
+    x: float,
+    y: float,
+    yaw: float,
+    segments: np.ndarray,
+    circles: np.ndarray,
+    max_range_m: float = MAX_RANGE_M,
+) -> tuple[np.ndarray, float]:
+    """Return what :func:`sector_distances` does, and the smallest of those distances."""
+    out = np.full(NUM_BINS, np.inf)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    for k in range(segments.shape[0]):
+        x0, y0, x1, y1 = segments[k, 0] - x, segments[k, 1] - y, segments[k, 2] - x, segments[k, 3] - y
+        # Most segments of a map are far away: these four comparisons spare them everything else.
+        if (
+            min(x0, x1) >= max_range_m
+            or max(x0, x1) <= -max_range_m
+            or min(y0, y1) >= max_range_m
+            or max(y0, y1) <= -max_range_m
+        ):
+            continue
+        _add_segment(
+            out,
+            cos * x0 + sin * y0,
+            cos * y0 - sin * x0,
+            cos * x1 + sin * y1,
+            cos * y1 - sin * x1,
+            max_range_m,
+        )
+    for k in range(circles.shape[0]):
+        dx, dy = circles[k, 0] - x, circles[k, 1] - y
+        _add_circle(out, cos * dx + sin * dy, cos * dy - sin * dx, circles[k, 2], max_range_m)
+    nearest = np.inf
+    for k in range(NUM_BINS):
+        if out[k] >= max_range_m:
+            out[k] = np.inf
+        nearest = min(nearest, out[k])
+    return out, nearest
+
+
+@numba.njit(cache=True)
 def sector_distances(
     x: float,
     y: float,
@@ -178,30 +219,4 @@ def sector_distances(
         >>> float(sector_distances(0.0, 0.0, 0.0, wall, np.empty((0, 3)))[0])
         2.0
     """
-    out = np.full(NUM_BINS, np.inf)
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    for k in range(segments.shape[0]):
-        x0, y0, x1, y1 = segments[k, 0] - x, segments[k, 1] - y, segments[k, 2] - x, segments[k, 3] - y
-        # Most segments of a map are far away: these four comparisons spare them everything else.
-        if (
-            min(x0, x1) >= max_range_m
-            or max(x0, x1) <= -max_range_m
-            or min(y0, y1) >= max_range_m
-            or max(y0, y1) <= -max_range_m
-        ):
-            continue
-        _add_segment(
-            out,
-            cos * x0 + sin * y0,
-            cos * y0 - sin * x0,
-            cos * x1 + sin * y1,
-            cos * y1 - sin * x1,
-            max_range_m,
-        )
-    for k in range(circles.shape[0]):
-        dx, dy = circles[k, 0] - x, circles[k, 1] - y
-        _add_circle(out, cos * dx + sin * dy, cos * dy - sin * dx, circles[k, 2], max_range_m)
-    for k in range(NUM_BINS):
-        if out[k] >= max_range_m:
-            out[k] = np.inf
-    return out
+    return scan(x, y, yaw, segments, circles, max_range_m)[0]

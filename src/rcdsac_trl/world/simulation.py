@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.bullet import pybullet
 from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
-from rcdsac_trl.world.lidar import sector_distances
+from rcdsac_trl.world.lidar import scan
 from rcdsac_trl.world.maps import Box, Cylinder, Map
 from rcdsac_trl.world.movers import Movers, WalkPlanner
 from rcdsac_trl.world.task import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S, clip_command
@@ -172,9 +172,9 @@ class Simulation:
         unnoticed = gap_m > max(self._movers.notice_gap_m, _MOVER_SYNC_GAP_M) + approach_m and not self._gui
         if unnoticed:
             self._movers.step(x, y, motor_steps - 1)
-        # Nothing is asked about contacts that cannot be.
+        # Contacts that cannot be are not asked for, nor the velocities that only contact would change.
         in_contact = False
-        look = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
+        touchable = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
         self._clearance_m = 0.0  # not known until the next scan
         for motor_step in range(motor_steps):
             if motor_step > 0 and not unnoticed:
@@ -182,15 +182,17 @@ class Simulation:
                 self._sync_movers(x, y, everywhere=self._gui)
             v, omega = clip_command(v_u, omega_u, v_c, omega_c)
             # By position, which PyBullet reads faster than keywords.
-            pybullet.resetBaseVelocity(robot, (v * cos, v * sin, 0.0), (0.0, 0.0, omega), client)
+            linear, angular = (v * cos, v * sin, 0.0), (0.0, 0.0, omega)
+            pybullet.resetBaseVelocity(robot, linear, angular, client)
             pybullet.stepSimulation(client)
             (x, y, _), turn = pybullet.getBasePositionAndOrientation(robot, client)
-            linear, angular = pybullet.getBaseVelocity(robot, client)
+            if touchable:
+                linear, angular = pybullet.getBaseVelocity(robot, client)
             yaw = 2.0 * math.atan2(turn[2], turn[3])
             cos, sin = math.cos(yaw), math.sin(yaw)
             v_c = linear[0] * cos + linear[1] * sin
             omega_c = angular[2]
-            if look and not in_contact:
+            if touchable and not in_contact:
                 points = pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
                 in_contact = any(point[8] <= CONTACT_DISTANCE_M for point in points)
             if self._gui:
@@ -208,8 +210,7 @@ class Simulation:
         """
         self._mover_circles[:, :2] = self._movers.positions
         x, y, yaw = self._pose
-        distances = sector_distances(x, y, yaw, self._segments, self._circles)
-        self._clearance_m = float(distances.min())
+        distances, self._clearance_m = scan(x, y, yaw, self._segments, self._circles)
         return distances
 
     def close(self) -> None:

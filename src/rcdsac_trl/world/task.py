@@ -144,7 +144,9 @@ def desired_velocities(action: Sequence[float] | NDArray) -> tuple[float, float]
         >>> desired_velocities([1.0, 0.1])
         (0.6, 0.0)
     """
-    u0, u1 = (min(max(float(u), -1.0), 1.0) for u in action)
+    u0, u1 = float(action[0]), float(action[1])
+    u0 = 1.0 if u0 > 1.0 else -1.0 if u0 < -1.0 else u0
+    u1 = 1.0 if u1 > 1.0 else -1.0 if u1 < -1.0 else u1
     linear = MIN_LINEAR_VELOCITY * (1.0 - u0) / 2.0 + MAX_LINEAR_VELOCITY * (1.0 + u0) / 2.0
     angular = MAX_ANGULAR_VELOCITY * u1
     return linear, 0.0 if _inside_dead_band(angular) else angular
