@@ -196,7 +196,7 @@ RUN = "run=<the tiny run>"
         ([RUN, "beta=[-1]", "num_maps=0"], "num_maps=0 must be at least 1"),
         ([RUN, "beta=[-1]", "num_episodes=1.5"], "num_episodes=1.5 must be a whole number"),
         ([RUN, "beta=[-1]", "seed=-1"], "seed=-1 must be at least 0"),
-        ([RUN, "beta=[-1]", "num_workers=3"], "num_workers=3 cannot share 10 agents evenly"),
+        ([RUN, "beta=[-1]", "num_workers=-3"], "num_workers=-3 is not a number of processes"),
         ([RUN, "beta=[-1]", "threads=all"], "threads=all must be a whole number or auto"),
         ([RUN, "beta=[-1]", "device=tpu"], "device=tpu is not supported"),
         ([RUN, "beta=[-1]", "map=moon"], "map=moon does not exist: choose one of "),

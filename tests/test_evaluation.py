@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import multiprocessing
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -58,11 +59,12 @@ def test_the_same_run_evaluated_twice_gives_identical_files(run: Path, tmp_path:
     assert contents(evaluate(*given, f"out={tmp_path / 'a'}")) == first
 
 
-def test_workers_do_not_change_an_evaluation(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = [f"run={run}", "beta=[-2,-1]"]
+@pytest.mark.parametrize("sampled", ["false", "true"])
+def test_processes_do_not_change_an_evaluation(run: Path, tmp_path: Path, sampled: str) -> None:
+    given = [f"run={run}", "beta=[-2,-1]", "num_maps=3", f"sampled={sampled}"]
     alone = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
-    monkeypatch.setattr("rcdsac_trl.pipeline.build.world.make_env", partial(make_env, serial=True))
     assert contents(evaluate(*given, f"out={tmp_path / 'b'}", "num_workers=2")) == alone
+    assert not multiprocessing.active_children()
 
 
 def test_another_seed_split_or_agent_gives_other_episodes(run: Path, tmp_path: Path) -> None:
@@ -215,19 +217,15 @@ class Nothing(TensorDictModuleBase):
 @pytest.mark.parametrize("sampled", [False, True])
 def test_a_table_of_known_episodes(sampled: bool) -> None:
     conditions = [Condition(collision_weight=2.0), Condition(collision_weight=1.0)]
-    policy, done = Nothing(), []
-    table = evaluation.evaluate(
-        Hits(4),
-        policy,
-        conditions=conditions,
-        num_agents=2,
-        num_maps=3,
-        steps=4,
-        sampled=sampled,
-        on_map=done.append,
+    policy, env = Nothing(), Hits(4)
+    table = evaluation.table_of(
+        evaluation.measure_map(
+            env, policy, conditions=conditions, num_agents=2, map_index=map_index, steps=4, sampled=sampled
+        )
+        for map_index in (2, 0, 1)
     )
     assert policy.kinds == {ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC}
-    assert done == [1, 2, 3]
+    assert table["map"].tolist() == [0, 0, 1, 1, 2, 2] * 2
     assert len(table) == 2 * 3 * 2
     assert table["collision_weight"].tolist() == [1.0] * 6 + [2.0] * 6  # sorted, whatever order was asked for
     assert table["beta"].isna().all()
@@ -310,13 +308,13 @@ def test_a_run_meets_the_same_episodes_as_the_baseline(run: Path) -> None:
 def test_actions_are_tanh_of_the_mean(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[TensorDictBase] = []
 
-    def watched(env: EnvBase, policy: TensorDictModuleBase, steps: int) -> TensorDictBase:
+    def watched(env: EnvBase, policy: TensorDictModuleBase, steps: int, episode: int | None) -> TensorDictBase:
         def drive(tensordict: TensorDictBase) -> TensorDictBase:
             out = policy(tensordict)
             seen.append(out.select("loc", "scale", "action").clone())
             return out
 
-        return run_episodes(env, drive, steps)  # type: ignore[arg-type]
+        return run_episodes(env, drive, steps, episode)  # type: ignore[arg-type]
 
     monkeypatch.setattr(evaluation, "run_episodes", watched)
     evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'a'}")

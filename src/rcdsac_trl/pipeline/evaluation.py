@@ -2,7 +2,7 @@
 
 import contextlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +15,27 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.metrics import METRICS, Condition, episode_metrics, summarise
 
 # What an episode's row needs; everything else of a step is dropped at once.
 _KEPT = [("next", key) for key in ("contact", "goal_reached", "reward_components", "velocity")]
 
 
-def run_episodes(env: EnvBase, policy: TensorDictModuleBase, steps: int) -> TensorDictBase:
-    """Drive one episode in every agent of the env, from its next reset on.
+def run_episodes(env: EnvBase, policy: TensorDictModuleBase, steps: int, episode: int | None = None) -> TensorDictBase:
+    """Drive one episode in every agent of the env.
+
+    Args:
+        env: holds the agents.
+        policy: writes `action`.
+        steps: length of an episode.
+        episode: number of the episode and its map; None: the env's next one.
 
     Returns:
         TensorDict ``[N, steps]`` with the keys that :func:`episode_metrics` reads; N counts the env's agents in
         the order of their batch.
     """
-    tensordict = env.reset()
+    tensordict = env.reset() if episode is None else env.reset(episode=episode)
     kept = []
     for _ in range(steps):
         tensordict = env.step(policy(tensordict))
@@ -37,18 +44,18 @@ def run_episodes(env: EnvBase, policy: TensorDictModuleBase, steps: int) -> Tens
     return torch.stack(kept, 1)
 
 
-def evaluate(
+def measure_map(
     env: EnvBase,
     policy: TensorDictModuleBase,
     *,
     conditions: Sequence[Condition],
     num_agents: int,
-    num_maps: int,
+    map_index: int,
     steps: int,
     sampled: bool = False,
-    on_map: Callable[[int], None] | None = None,
-) -> pd.DataFrame:
-    """Measure a policy on the env's next maps.
+    episode: int | None = None,
+) -> Rows:
+    """Measure a policy on one map.
 
     Args:
         env: holds ``len(conditions) * num_agents`` agents, condition after condition; agent i of every condition
@@ -56,30 +63,33 @@ def evaluate(
         policy: writes `action`.
         conditions: what the agents of each block are told (the env's transforms tell them; here it labels rows).
         num_agents: episodes a map and a condition.
-        num_maps: maps to drive on.
+        map_index: the map's number in the rows.
         steps: length of an episode.
         sampled: draw actions instead of taking tanh(mean).
-        on_map: called with the number of maps done after each.
+        episode: see :func:`run_episodes`.
 
     Returns:
         One row an episode: `beta`, `collision_weight`, `map`, `episode` and :data:`METRICS`.
     """
     kind = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
-    rows = []
     with torch.no_grad(), set_exploration_type(kind):
-        for map_index in range(num_maps):
-            measured = episode_metrics(run_episodes(env, policy, steps))
-            for i in range(len(conditions) * num_agents):
-                condition = conditions[i // num_agents]
-                row = {
-                    "beta": condition.beta,
-                    "collision_weight": condition.collision_weight,
-                    "map": map_index,
-                    "episode": i % num_agents,
-                }
-                rows.append(row | {metric: measured[metric][i].item() for metric in METRICS})
-            if on_map is not None:
-                on_map(map_index + 1)
+        measured = episode_metrics(run_episodes(env, policy, steps, episode))
+    rows = []
+    for i in range(len(conditions) * num_agents):
+        condition = conditions[i // num_agents]
+        row = {
+            "beta": condition.beta,
+            "collision_weight": condition.collision_weight,
+            "map": map_index,
+            "episode": i % num_agents,
+        }
+        rows.append(row | {metric: measured[metric][i].item() for metric in METRICS})
+    return rows
+
+
+def table_of(maps: Iterable[Rows]) -> pd.DataFrame:
+    """Return the rows of all maps in the order of condition, map and episode, whatever order they come in."""
+    rows = [row for rows in maps for row in rows]
     table = pd.DataFrame(rows).astype({"beta": float, "collision_weight": float})
     return table.sort_values(["beta", "collision_weight", "map", "episode"], ignore_index=True)
 
@@ -88,7 +98,7 @@ class Validation:
     """Measures a policy on the same maps at every call, for as long as it trains.
 
     Args:
-        env: as for :func:`evaluate`; made for this alone, and closed by :meth:`close`.
+        env: as for :func:`measure_map`; made for this alone, and closed by :meth:`close`.
         policy: acts; its weights may change between calls.
         conditions: what the agents of each block are told.
         num_agents: episodes a map and a condition.
@@ -117,15 +127,18 @@ class Validation:
         self.seed = seed
 
     def __call__(self) -> pd.DataFrame:
-        """Return one row an episode, see :func:`evaluate`."""
+        """Return one row an episode, see :func:`measure_map`."""
         self.env.set_seed(self.seed)
-        return evaluate(
-            self.env,
-            self.policy,
-            conditions=self.conditions,
-            num_agents=self.num_agents,
-            num_maps=self.num_maps,
-            steps=self.steps,
+        return table_of(
+            measure_map(
+                self.env,
+                self.policy,
+                conditions=self.conditions,
+                num_agents=self.num_agents,
+                map_index=map_index,
+                steps=self.steps,
+            )
+            for map_index in range(self.num_maps)
         )
 
     def close(self) -> None:
@@ -148,7 +161,7 @@ class EvaluationRun:
         out: the folder; made when the results are there.
         described: what is evaluated and how; equal descriptions give equal files.
         num_maps: maps to drive on.
-        rows: drives the episodes; called with what to call after each map.
+        maps: yields the rows of each map as it has been driven.
 
     Raises:
         UserInputError: if the folder holds another evaluation.
@@ -160,12 +173,12 @@ class EvaluationRun:
         out: Path,
         described: Mapping[str, Any],
         num_maps: int,
-        rows: Callable[[Callable[[int], None]], pd.DataFrame],
+        maps: Callable[[], Generator[Rows, None, None]],
     ) -> None:
         self.out = out
         self.described = json.dumps(described, indent=2) + "\n"
         self.num_maps = num_maps
-        self.rows = rows
+        self.maps = maps
         if out.exists() and not out.is_dir():
             raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
         path = out / "evaluation.json"
@@ -174,12 +187,9 @@ class EvaluationRun:
 
     def run(self) -> None:
         """Drive, write, and print the summary."""
-        with tqdm(total=self.num_maps, unit="map", disable=None) as bar:
-
-            def show(maps_done: int) -> None:
-                bar.update(maps_done - bar.n)
-
-            episodes = self.rows(show)
+        # Closed here and now where Ctrl-C comes between two maps, and with them what drives.
+        with contextlib.closing(self.maps()) as maps:
+            episodes = table_of(tqdm(maps, total=self.num_maps, unit="map", disable=None))
         summary = summarise(episodes, ["beta", "collision_weight"])
         self.out.mkdir(parents=True, exist_ok=True)
         episodes.to_csv(self.out / "episodes.csv", index=False, float_format="%.9g")

@@ -9,6 +9,7 @@ from typing import Literal
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.pipeline.drivers import resolve_processes
 from rcdsac_trl.pipeline.settings import AlgoSettings, LearnerSettings, Schedule, WorldSettings
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.task import TaskSettings
@@ -171,4 +172,5 @@ class EvaluationSettings:
         _check_least("seed", self.seed, 0)
         _check_least("num_maps", self.num_maps, 1)
         _check_least("num_episodes", self.num_episodes, 1)
+        resolve_processes(self.num_workers, self.num_maps)
         runtime.resolve_threads(self.threads)

@@ -1,11 +1,14 @@
 """An evaluation from its config."""
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
-import pandas as pd
+import safetensors.torch
+import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
@@ -16,13 +19,14 @@ from rcdsac_trl.pipeline.build.read import evaluation_settings, settings_of_run,
 from rcdsac_trl.pipeline.build.world import evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import load_weights
 from rcdsac_trl.pipeline.cli import compose
-from rcdsac_trl.pipeline.evaluation import EvaluationRun, evaluate
+from rcdsac_trl.pipeline.drivers import Drive, Rows, drive_maps, resolve_processes
+from rcdsac_trl.pipeline.evaluation import EvaluationRun, measure_map
 from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.policies import PursuitPolicy
 from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, find
 from rcdsac_trl.pipeline.settings import WorldSettings
-from rcdsac_trl.seeding import torch_stream
+from rcdsac_trl.seeding import torch_seed
 
 
 def evaluation(cfg: DictConfig) -> EvaluationRun:
@@ -46,32 +50,17 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     else:
         default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
 
-    def rows(on_map: Callable[[int], None]) -> pd.DataFrame:
-        runtime.set_threads(settings.threads)
-        env = evaluation_environment(
-            world, algo, conditions, settings.split, settings.seed, settings.num_episodes, trained.network.memory
-        )
-        if algo is None:
-            policy: TensorDictModuleBase = PursuitPolicy()
-        else:
-            average = make_average(make_loss(trained, device), trained.learner)
+    def maps() -> Generator[Rows, None, None]:
+        weights = None
+        if algo is not None:
+            average = make_average(make_loss(trained, "cpu"), trained.learner)
             for damaged in load_weights(checkpoints, settings.checkpoint, average=average):
                 print(f"rcdsac_trl: {damaged}", file=sys.stderr)
-            generator = torch_stream(settings.seed, "evaluation actions", device=device)
-            policy = make_policy(average.module, env, generator, device)
-        try:
-            return evaluate(
-                env,
-                policy,
-                conditions=conditions,
-                num_agents=settings.num_episodes,
-                num_maps=settings.num_maps,
-                steps=world.task.episode_steps,
-                sampled=settings.sampled,
-                on_map=on_map,
-            )
-        finally:
-            env.close()
+            # Read once: a training that goes on may write another checkpoint meanwhile.
+            weights = safetensors.torch.save(average.module.state_dict())
+        make = partial(_driver, settings, trained, world, conditions, device, weights)
+        processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
+        return drive_maps(make, settings.num_maps, processes)
 
     described = {
         "agent": settings.baseline if algo is None else algo.name,
@@ -92,8 +81,59 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         out=Path(settings.out) if settings.out is not None else default_out,
         described=described,
         num_maps=settings.num_maps,
-        rows=rows,
+        maps=maps,
     )
+
+
+@contextlib.contextmanager
+def _driver(
+    settings: EvaluationSettings,
+    trained: TrainingSettings,
+    world: WorldSettings,
+    conditions: Sequence[Condition],
+    device: str,
+    weights: bytes | None,
+) -> Iterator[Drive]:
+    """Make what drives one map after another, in this process.
+
+    Args:
+        settings: the evaluation's.
+        trained: those of the run's training.
+        world: what is driven in.
+        conditions: what the agents of each block are told.
+        device: where the policy acts.
+        weights: the actor's, packed; None for the baseline.
+    """
+    runtime.set_threads(1 if settings.threads == "auto" else settings.threads)
+    algo = None if weights is None else trained.algo
+    env = evaluation_environment(
+        world, algo, conditions, settings.split, settings.seed, settings.num_episodes, trained.network.memory
+    )
+    noise = torch.Generator(device=device)
+    policy: TensorDictModuleBase = PursuitPolicy()
+    if weights is not None:
+        actor = make_average(make_loss(trained, device), trained.learner).module
+        actor.load_state_dict(safetensors.torch.load(weights))
+        policy = make_policy(actor, env, noise, device)
+
+    def drive(map_index: int) -> Rows:
+        # By the map's number, so that it does not matter which process drives it.
+        noise.manual_seed(torch_seed(settings.seed, "evaluation actions", map_index))
+        return measure_map(
+            env,
+            policy,
+            conditions=conditions,
+            num_agents=settings.num_episodes,
+            map_index=map_index,
+            steps=world.task.episode_steps,
+            sampled=settings.sampled,
+            episode=map_index,
+        )
+
+    try:
+        yield drive
+    finally:
+        env.close()
 
 
 def _trained(settings: EvaluationSettings) -> TrainingSettings:
@@ -115,6 +155,6 @@ def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, n
         task=settings.task or trained.task,
         sensor=sensor.name,
         num_agents=settings.num_episodes * num_conditions,
-        num_workers=0 if settings.gui else settings.num_workers,
+        num_workers=0,  # a process drives whole maps
         gui=settings.gui,
     )
