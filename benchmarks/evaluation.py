@@ -1,0 +1,65 @@
+"""Seconds that an evaluation takes: 50 maps x 10 episodes x 1,000 steps with a real actor, on all cores.
+
+It runs the command's own code on an untrained agent, whose networks cost the same; one more map first starts the
+processes and is not counted. With fewer `--maps` the time is extrapolated linearly.
+"""
+
+import tempfile
+import time
+from pathlib import Path
+
+import bench_world as bench
+
+MAPS = 50
+
+
+def main() -> None:
+    parser = bench.parser(__doc__)
+    parser.add_argument("--maps", type=int, default=MAPS, help="maps that are driven")
+    parser.add_argument("--num-workers", default="auto", help="processes, as num_workers of conf/evaluate.yaml")
+    options = parser.parse_args()
+    bench.prepare()
+    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.pipeline.cli import compose
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = untrained(Path(folder) / "run")
+        given = [f"run={run}", "beta=[-1]", f"num_workers={options.num_workers}", f"num_maps={options.maps + 2}"]
+        evaluation = build.evaluation(compose("evaluate", given))
+        done = []
+        for _ in evaluation.maps():
+            done.append(time.perf_counter())
+    # From the second map done, when every process of two is at work, to the last.
+    per_map = (done[-1] - done[1]) / options.maps
+    bench.report(
+        {
+            "cores": len(bench.cores()),
+            "num_workers": options.num_workers,
+            "maps_driven": options.maps,
+            "extrapolated": options.maps != MAPS,
+            "seconds_for_500_episodes": per_map * MAPS,
+            "agent_steps_per_second": 10_000 / per_map,
+        },
+        options,
+    )
+
+
+def untrained(folder: Path) -> Path:
+    """Write a run folder whose agent has its first weights and the default world."""
+    from rcdsac_trl.pipeline import logs
+    from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_optimizer
+    from rcdsac_trl.pipeline.build.read import training_settings
+    from rcdsac_trl.pipeline.checkpoint import Checkpoints
+    from rcdsac_trl.pipeline.cli import compose
+
+    cfg = compose("train", ["+algo=rcdsac_pow", "logger=none"])
+    settings = training_settings(cfg)
+    logs.start_run_folder(folder, cfg, {})
+    loss = make_loss(settings, "cpu")
+    average = make_average(loss, settings.learner)
+    Checkpoints(folder / "checkpoints", loss, average, make_optimizer(loss, settings.learner)).save("best", {})
+    return folder
+
+
+if __name__ == "__main__":
+    main()
