@@ -69,7 +69,7 @@ def collected(num_workers: int | str, batches: int, steps: int) -> float:
         agent_ids=range(bench.NUM_AGENTS),
         memory=settings.network.memory,
     )
-    policy = make_policy(make_loss(settings, "cpu").actor_network, env, torch.Generator(), "cpu")
+    policy = make_policy(make_loss(settings, "cpu").actor_network, torch.Generator(), "cpu")
     replay = make_replay(settings, "cpu")
     per_batch = bench.NUM_AGENTS * steps
     collector = Collector(

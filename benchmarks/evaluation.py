@@ -26,9 +26,7 @@ def main() -> None:
         run = untrained(Path(folder) / "run")
         given = [f"run={run}", "beta=[-1]", f"num_workers={options.num_workers}", f"num_maps={options.maps + 2}"]
         evaluation = build.evaluation(compose("evaluate", given))
-        done = []
-        for _ in evaluation.maps():
-            done.append(time.perf_counter())
+        done = [time.perf_counter() for _ in evaluation.maps()]
     # From the second map done, when every process of two is at work, to the last.
     per_map = (done[-1] - done[1]) / options.maps
     bench.report(

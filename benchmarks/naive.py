@@ -7,8 +7,9 @@ A worker process for each agent; walls and clutter as one PyBullet body each; a 
 import math
 from typing import Any
 
-import bench_world as bench
 import numpy as np
+
+import bench_world as bench
 
 
 def _make_naive() -> None:

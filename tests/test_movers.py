@@ -131,3 +131,26 @@ def test_mover_stops_at_once_when_the_robot_runs_into_its_front():
     stopped = movers.positions[0].copy()
     movers.step(*ahead)
     assert (movers.positions[0] == stopped).all()
+
+
+def test_many_periods_at_once_are_the_same_walk():
+    corners = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
+    one, many = mover_on(corners), mover_on(corners)
+    walk(one, 7 * MOTOR_PERIOD_S)
+    gap = many.step(1e3, 1e3, periods=7)
+    assert (one.positions == many.positions).all()
+    assert gap == pytest.approx(math.hypot(*(np.array([1e3, 1e3]) - many.positions[0])) - 0.3 - 0.25)
+
+
+@pytest.mark.parametrize("top_speed", [0.2, 0.6, 2.0])
+def test_nobody_is_noticed_beyond_the_notice_gap(top_speed):
+    """The robot flees at the notice gap, right in front of the mover: the walk is that of a mover alone."""
+    corners = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0], [0.0, 9.0]])
+    alone, watched = mover_on(corners, top_speed), mover_on(corners, top_speed)
+    distance = 0.3 + 0.25 + watched.notice_gap_m
+    for _ in range(600):
+        before = watched.positions[0].copy()
+        alone.step(1e3, 1e3)
+        ahead = alone.positions[0] - before
+        watched.step(*(before + distance * ahead / max(np.hypot(*ahead), 1e-12)))
+        assert (watched.positions == alone.positions).all()

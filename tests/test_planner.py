@@ -8,6 +8,7 @@ from skimage.graph import MCP_Geometric
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
+from rcdsac_trl.world import geometry
 from rcdsac_trl.world.geometry import (
     CELL_M,
     ROBOT_RADIUS_M,
@@ -163,6 +164,32 @@ def test_nearest_cell_by_hand() -> None:
     free[0, 0] = free[2, 2] = True
     assert nearest_cell(free, 0.10, 0.12, 0.1) == 0
     assert nearest_cell(free, 0.25, 0.12, 0.1) == 8
+
+
+def test_nearest_cell_is_that_of_a_search_over_all_cells() -> None:
+    rng = stream(0, "nearest")
+    for share in (0.001, 0.02, 0.3):
+        free = rng.random((60, 45)) < share
+        free[7, 40] = True
+        rows, columns = np.nonzero(free)
+        for x, y in rng.uniform(-0.5, 6.5, (100, 2)):
+            distances = ((columns + 0.5) * 0.1 - x) ** 2 + ((rows + 0.5) * 0.1 - y) ** 2
+            nearest = nearest_cell(free, x, y, 0.1)
+            assert distances.min() == ((nearest % 45 + 0.5) * 0.1 - x) ** 2 + ((nearest // 45 + 0.5) * 0.1 - y) ** 2
+
+
+def test_a_leg_is_clear_where_its_clearance_is_enough() -> None:
+    planner = Planner(generate_map(MapSettings(), "train", seed=0, index=1))
+    boxes, circles = planner._true.boxes, planner._true.circles
+    extents = geometry._bounding_boxes(boxes)
+    rng, found = stream(0, "legs"), set()
+    for ax, ay, length, angle in rng.uniform((0, 0, 0, 0), (20, 20, 4, 7), (3000, 4)):
+        bx, by = ax + length * np.cos(angle), ay + length * np.sin(angle)
+        for need in (-1e-9, 0.3):
+            clear = geometry._is_clear(ax, ay, bx, by, boxes, extents, circles, need)
+            assert clear == (geometry.segment_clearance(ax, ay, bx, by, boxes, circles, need) >= need)
+            found.add((need, clear))
+    assert found == {(-1e-9, True), (0.3, True), (0.3, False)}
 
 
 def test_pull_tight_leaves_only_the_corner() -> None:

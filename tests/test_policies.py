@@ -1,4 +1,4 @@
-"""The pursuit baseline and the noisy pursuit that collects the first episodes."""
+"""The agent's policy made lean, the pursuit baseline and the noisy pursuit that collects the first episodes."""
 
 import math
 
@@ -6,9 +6,14 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.data import Bounded
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from rcdsac_trl.pipeline.policies import PERSISTENCE, CollectionPolicy, OnDevice, PursuitPolicy
+from rcdsac_trl.agent.actor import build_policy
+from rcdsac_trl.pipeline.build.agent import make_loss
+from rcdsac_trl.pipeline.policies import PERSISTENCE, CollectionPolicy, LeanPolicy, OnDevice, PursuitPolicy
 from rcdsac_trl.world.pursuit import pursuit_action
+from tiny import tiny_settings
 
 AHEAD = torch.tensor([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
 NOISE = 0.1
@@ -123,3 +128,24 @@ def test_on_device_writes_what_the_policy_writes() -> None:
     out = policy(given.clone())
     assert set(out.keys()) == {*given.keys(), "action"}
     assert torch.equal(out["action"], PursuitPolicy()(observed(2))["action"])
+
+
+@pytest.mark.parametrize("row", ["rcdsac_pow", "sac", "rcwr"])
+@pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+@pytest.mark.parametrize("batch", [(4,), (2, 2)])
+def test_the_lean_policy_is_the_policy_bit_by_bit(row: str, kind: ExplorationType, batch: tuple[int, ...]) -> None:
+    actor = make_loss(tiny_settings(row), "cpu").actor_network
+    plain = build_policy(actor, Bounded(-1.0, 1.0, (2,)), torch.Generator().manual_seed(5))
+    lean = LeanPolicy(actor, torch.Generator().manual_seed(5))
+    assert set(lean.in_keys) == set(plain.in_keys)
+    assert set(lean.out_keys) == set(plain.out_keys)
+    sizes = {"range": 180, "waypoint": 6, "velocity": 4, "recurrent_state": 128, "risk": 1, "collision_weight": 1}
+    with torch.no_grad(), set_exploration_type(kind):
+        for seed in range(3):
+            generator = torch.Generator().manual_seed(seed)
+            given = {key: -torch.rand(*batch, size, generator=generator) for key, size in sizes.items()}
+            given["is_init"] = torch.rand(*batch, 1, generator=generator) < 0.5
+            expected = plain(TensorDict(given, batch_size=batch))
+            found = lean(TensorDict(given, batch_size=batch))
+            for key in plain.out_keys:
+                assert torch.equal(found[key], expected[key]), key

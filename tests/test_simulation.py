@@ -9,6 +9,7 @@ import pybullet
 import pytest
 
 from rcdsac_trl.seeding import stream
+from rcdsac_trl.world import simulation as world_simulation
 from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import Box, Cylinder, Map, MapSettings, Mover, generate_map
 from rcdsac_trl.world.movers import STOP_GAP_M
@@ -316,3 +317,25 @@ def test_map_without_movers(simulation):
     load(simulation, room(), (4.0, 4.0, 0.0))
     assert simulation.mover_positions.shape == (0, 2)
     assert simulation.mover_radii.shape == (0,)
+
+
+@pytest.mark.parametrize("num_movers", [1, 12])
+def test_what_is_not_asked_and_not_repeated_changes_nothing(simulation, monkeypatch, num_movers):
+    """Movers that walk ahead, contacts and velocities that are taken as known: the bits are those of the long way."""
+
+    def drive(slack_m):
+        monkeypatch.setattr(world_simulation, "_SLACK_M", slack_m)
+        settings = MapSettings(size_m=12.0, clutter_per_m2=0.15, num_movers=num_movers, mover_speed_m_per_s=(0.2, 1.5))
+        map = generate_map(settings, "train", seed=2, index=num_movers)
+        planner, rng = Planner(map), stream(2, "drive")
+        load(simulation, map, (*planner.sample_free(rng).tolist(), 0.0))
+        seen = []
+        for _ in range(400):
+            result = simulation.step(rng.uniform(-0.2, 0.6), rng.uniform(-1.5, 1.5), int(rng.integers(1, 9)))
+            seen.append((result, simulation.mover_positions.tolist(), simulation.scan().tolist()))
+        return seen
+
+    short, long = drive(world_simulation._SLACK_M), drive(math.inf)
+    assert short == long
+    contacts = sum(result.in_contact for result, _, _ in short)
+    assert 0 < contacts < 400, "both ways were taken"

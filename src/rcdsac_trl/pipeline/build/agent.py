@@ -3,13 +3,12 @@
 import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictParams, TensorDictSequential
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
-from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic, build_policy
+from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
 from rcdsac_trl.agent.losses import DistributionalSACLoss
 from rcdsac_trl.agent.transforms import Relabel
-from rcdsac_trl.pipeline.policies import OnDevice
+from rcdsac_trl.pipeline.policies import LeanPolicy, OnDevice
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import LearnerSettings
 from rcdsac_trl.seeding import torch_seed, torch_stream
@@ -54,11 +53,9 @@ def make_average(loss: LossModule, learner: LearnerSettings) -> AveragedModel:
     return AveragedModel(loss.actor_network, multi_avg_fn=get_ema_multi_avg_fn(decay))
 
 
-def make_policy(
-    actor: TensorDictSequential, env: EnvBase, generator: torch.Generator, device: str
-) -> TensorDictModuleBase:
+def make_policy(actor: TensorDictSequential, generator: torch.Generator, device: str) -> TensorDictModuleBase:
     """Make the acting policy of an actor; it shares the actor's weights."""
-    policy = build_policy(actor, env.action_spec_unbatched, generator=generator)
+    policy = LeanPolicy(actor, generator)
     return policy if device == "cpu" else OnDevice(policy, device)
 
 

@@ -114,7 +114,7 @@ def _driver(
     if weights is not None:
         actor = make_average(make_loss(trained, device), trained.learner).module
         actor.load_state_dict(safetensors.torch.load(weights))
-        policy = make_policy(actor, env, noise, device)
+        policy = make_policy(actor, noise, device)
 
     def drive(map_index: int) -> Rows:
         # By the map's number, so that it does not matter which process drives it.

@@ -198,7 +198,7 @@ def _collection(
     )
     exploration = torch.Generator(device=device)
     policy = CollectionPolicy(
-        make_policy(loss.actor_network, env, exploration, device),
+        make_policy(loss.actor_network, exploration, device),
         generator=exploration,
         seed=settings.seed,
         pursuit_iterations=schedule.pursuit_iterations,
@@ -225,7 +225,7 @@ def _validation(settings: TrainingSettings, actor: TensorDictSequential, device:
     )
     return Validation(
         env,
-        make_policy(actor, env, torch.Generator(device=device), device),
+        make_policy(actor, torch.Generator(device=device), device),
         conditions=conditions,
         num_agents=world.num_agents,
         num_maps=settings.validation.num_maps,
