@@ -48,7 +48,12 @@ def _drive(env: Any, recording: bench.Recording) -> None:
 
 
 def collected(num_workers: int | str, batches: int, steps: int) -> float:
-    """Time the collection of a training; return agent steps a second of wall time."""
+    """Time the collection of a training.
+
+    Returns:
+        Agent steps a second: of processor time where all is in this process, which has one thread; of wall time with
+        workers.
+    """
     import torch
     from torchrl.collectors import Collector
     from torchrl.envs.utils import ExplorationType
@@ -88,7 +93,8 @@ def collected(num_workers: int | str, batches: int, steps: int) -> float:
         replay.add_episodes(batch.reshape(-1, batch.shape[-1]))
 
     collect()  # workers start, code is compiled
-    seconds = min(bench.wall_seconds(collect) for _ in range(batches))
+    seconds_of = bench.wall_seconds if num_workers else bench.cpu_seconds
+    seconds = min(seconds_of(collect) for _ in range(batches))
     collector.shutdown()
     return per_batch / seconds
 

@@ -1,9 +1,11 @@
 """How the world's speed grows with agents, workers and obstacles, and the replay's memory with steps; a figure.
 
-`scaling(...)` is called by `scaling.py` too. Rates are agent steps a second of wall time; the fastest of some
+Rates are agent steps a second: of processor time in one process, of wall time with workers; the fastest of some
 repetitions counts.
 """
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +16,37 @@ AGENTS = (1, 2, 5, 10, 20, 40)
 WORKERS = (0, 1, 2, 5, 10)
 CLUTTER_PER_M2 = (0.0, 0.035, 0.07, 0.14, 0.28)
 REPLAY_STEPS = (10_000, 20_000, 50_000, 100_000)
+_STEPS, _TURNS = 10, 15
 
 
-def rate(env: Any, steps: int = 40, repeats: int = 4) -> float:
-    """Drive an environment by noisy pursuit; return agent steps a second."""
+def rates(envs: dict[float, Any], seconds_of: Callable[[Callable[[], object]], float]) -> dict[float, float]:
+    """Drive environments by noisy pursuit, in turns so that what disturbs one disturbs all; close them.
+
+    Returns:
+        Agent steps a second of each, from the fastest of its turns.
+    """
     import torch
 
     from rcdsac_trl.world.pursuit import pursuit_action
 
-    tensordict = env.reset()
+    now = {key: env.reset() for key, env in envs.items()}
+    fastest = dict.fromkeys(envs, float("inf"))
 
-    def drive() -> None:
-        nonlocal tensordict
-        for _ in range(steps):
+    def drive(key: float) -> None:
+        env, tensordict = envs[key], now[key]
+        for _ in range(_STEPS):
             noise = torch.randn(*env.batch_size, 2)
             tensordict["action"] = (pursuit_action(tensordict["waypoint"]) + 0.7 * noise).clamp(-1.0, 1.0)
             tensordict = env.step(tensordict)["next"]
+        now[key] = tensordict
 
-    drive()
-    seconds = min(bench.wall_seconds(drive) for _ in range(repeats))
-    env.close()
-    return steps * env.batch_size.numel() / seconds
+    for _ in range(_TURNS):
+        for key in envs:
+            fastest[key] = min(fastest[key], seconds_of(partial(drive, key)))
+    numbers = {key: _STEPS * env.batch_size.numel() / fastest[key] for key, env in envs.items()}
+    for env in envs.values():
+        env.close()
+    return numbers
 
 
 def scaling() -> dict[str, dict[float, float]]:
@@ -42,12 +54,12 @@ def scaling() -> dict[str, dict[float, float]]:
     from rcdsac_trl.world.env import make_env
     from rcdsac_trl.world.maps import MapSettings
 
+    agents: dict[float, Any] = {n: make_env(agent_ids=range(n), num_workers=0) for n in AGENTS}
+    clutter = {density: make_env(MapSettings(clutter_per_m2=density), num_workers=0) for density in CLUTTER_PER_M2}
     return {
-        "agents": {n: rate(make_env(agent_ids=range(n), num_workers=0)) for n in AGENTS},
-        "workers": {n: rate(make_env(num_workers=n)) for n in WORKERS},
-        "clutter_per_m2": {
-            density: rate(make_env(MapSettings(clutter_per_m2=density), num_workers=0)) for density in CLUTTER_PER_M2
-        },
+        "agents": rates(agents, bench.cpu_seconds),
+        "workers": rates({n: make_env(num_workers=n) for n in WORKERS}, bench.wall_seconds),
+        "clutter_per_m2": rates(clutter, bench.cpu_seconds),
         "replay_megabytes": {float(steps): replay_bytes(steps) / 1e6 for steps in REPLAY_STEPS},
     }
 

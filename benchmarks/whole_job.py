@@ -4,6 +4,8 @@ The run is the command's own: `preset=laptop` with fewer and shorter iterations,
 in some iterations (validation, checkpoints) happens here as often for its length as there.
 """
 
+import contextlib
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -43,7 +45,8 @@ def main() -> None:
     shorter = [f"schedule.{name}_iterations=1" for name in ("pursuit", "neutral", "ramp", "decay")]
     given = ["+algo=rcdsac_pow", *shorter, f"schedule.iterations={options.iterations}", *options.overrides]
     started = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
+    # The run's own messages are not results.
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
         trainer = build.trainer(compose("train", given), Path(folder) / "run")
         startup = time.perf_counter() - started
         parts = {
