@@ -9,11 +9,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torchrl.objectives import SoftUpdate
 
-from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_optimizer, make_relabel, parameters
+from rcdsac_trl.pipeline.build import training
 from rcdsac_trl.pipeline.build.read import training_settings
-from rcdsac_trl.pipeline.build.training import make_replay
 from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.trainer import Learner
 from rcdsac_trl.seeding import torch_stream
@@ -25,20 +23,10 @@ EPISODES = 20
 def make_learner(algo: str, overrides: list[str]) -> Learner:
     """Make the learner of a training, its replay filled with random episodes of the configured sensor."""
     settings = training_settings(compose("train", [f"+algo={algo}", *overrides, "replay.capacity_steps=20000"]))
-    replay = make_replay(settings, "cpu")
+    learner = training.make_learner(settings, "cpu")
     mask = torch.from_numpy(sensor_mask(settings.sensor.name))
-    replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask))
-    loss = make_loss(settings, "cpu")
-    return Learner(
-        replay=replay,
-        loss=loss,
-        relabel=make_relabel(settings, "cpu"),
-        optimizer=make_optimizer(loss, settings.learner),
-        targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
-        clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],
-        max_grad_norm=settings.learner.max_grad_norm,
-        average=make_average(loss, settings.learner),
-    )
+    learner.replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask))
+    return learner
 
 
 def random_episodes(number: int, steps: int, mask: torch.Tensor) -> TensorDict:

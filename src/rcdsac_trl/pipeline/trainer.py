@@ -14,6 +14,7 @@ from torchrl.collectors import Collector
 from torchrl.objectives import LossModule, SoftUpdate
 from tqdm import tqdm
 
+from rcdsac_trl.agent.transforms import Relabel
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
 from rcdsac_trl.pipeline.durable import FolderLock
@@ -47,7 +48,7 @@ class Learner:
         *,
         replay: SequenceReplay,
         loss: LossModule,
-        relabel: Callable[[TensorDictBase], TensorDictBase] | None,
+        relabel: Relabel | None,
         optimizer: torch.optim.Optimizer,
         targets: SoftUpdate,
         clipped: list[list[nn.Parameter]],

@@ -68,6 +68,21 @@ def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
     )
 
 
+def make_learner(settings: TrainingSettings, device: str) -> Learner:
+    """Make the networks and all that updates them, with an empty replay."""
+    loss = make_loss(settings, device)
+    return Learner(
+        replay=make_replay(settings, device),
+        loss=loss,
+        relabel=make_relabel(settings, device),
+        optimizer=make_optimizer(loss, settings.learner),
+        targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
+        clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],
+        max_grad_norm=settings.learner.max_grad_norm,
+        average=make_average(loss, settings.learner),
+    )
+
+
 def trainer(cfg: DictConfig, folder: Path) -> Trainer:
     """Make a new training run that writes into a folder."""
     settings = training_settings(cfg)
@@ -123,20 +138,8 @@ def _assemble(
     settings: TrainingSettings, folder: Path, lock: FolderLock, saved: Saved | None, told: list[str]
 ) -> Trainer:
     device, threads = runtime.resolve_device(settings.device), runtime.set_threads(settings.threads)
-    loss = make_loss(settings, device)
-    average = make_average(loss, settings.learner)
-    optimizer = make_optimizer(loss, settings.learner)
-    relabel = make_relabel(settings, device)
-    learner = Learner(
-        replay=make_replay(settings, device),
-        loss=loss,
-        relabel=relabel,
-        optimizer=optimizer,
-        targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
-        clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],
-        max_grad_norm=settings.learner.max_grad_norm,
-        average=average,
-    )
+    learner = make_learner(settings, device)
+    loss, average, optimizer, relabel = learner.loss, learner.average, learner.optimizer, learner.relabel
     generators = {"replay": learner.replay.generator}
     if relabel is not None and relabel.generator is not None:
         generators["relabel"] = relabel.generator

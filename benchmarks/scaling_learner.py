@@ -1,6 +1,6 @@
 """How speed grows with what one may turn: one plot a curve.
 
-``python benchmarks/scaling.py learner`` draws updates per second against sequences, steps and quantile fractions into
+``python benchmarks/scaling_learner.py`` draws updates per second against sequences, steps and quantile fractions into
 ``docs/images/scaling_learner.png``; ``--json`` prints the numbers.
 """
 
@@ -78,19 +78,15 @@ def learner(arguments: argparse.Namespace) -> None:
     report(result, "\n".join(lines), as_json=arguments.json, out=arguments.out)
 
 
-PARTS = {"learner": learner}
-
-
 def main() -> None:
-    """Read the command line and run one part."""
+    """Read the command line, measure and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", choices=PARTS)
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of lines")
     parser.add_argument("--out", type=Path, help="also write the JSON object to this file")
     arguments = parser.parse_args()
     runtime.keep_pages()
     runtime.quiet_libraries()
-    PARTS[arguments.part](arguments)
+    learner(arguments)
 
 
 if __name__ == "__main__":
