@@ -182,7 +182,9 @@ class ReferenceLoss(LossModule):
         padded = torch.cat((action[:, :1], action), dim=1)
         with self.target_critic_network_params.to_module(self.critic_network):
             values = [self._value(critic, following, padded, tau)[:, 1:] for critic in self.critic_network]
-        value = torch.stack(values).amin(0) - alpha * log_prob.unsqueeze(-1)
+        both = torch.stack(values)
+        value = both.amin(0) if self.settings.target_over_critics == "minimum" else both.mean(0)
+        value = value - alpha * log_prob.unsqueeze(-1)
         alive = 1.0 - current["next", "terminated"].to(value.dtype)
         return current["next", "reward"] + self.settings.value_estimator.gamma * alive * value
 

@@ -91,6 +91,7 @@ def test_preset_paper_is_the_papers_table_of_hyper_parameters() -> None:
     assert (learner.actor_lr, learner.critic_lr, learner.alpha_lr) == (3e-4, 3e-4, 3e-4)
     assert learner.gamma == 0.99
     assert learner.target_coefficient == 0.001
+    assert (learner.num_critics, learner.target_over_critics) == (2, "minimum")
     assert learner.target_entropy == -2
     assert (learner.num_quantiles, learner.num_target_quantiles) == (16, 16)
     assert (learner.batch_size, learner.sequence_length, learner.burn_in) == (100, 64, 0)

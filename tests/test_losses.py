@@ -185,7 +185,7 @@ def linear_batch() -> TensorDict:
     return TensorDict(content, batch_size=(2, 3))
 
 
-def by_hand(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def by_hand(batch: TensorDictBase, over_critics: str = "minimum") -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Compute the linear networks' losses of each transition in scalar arithmetic, from the same random numbers."""
     g = torch.Generator().manual_seed(11)
     next_noise = torch.randn((2, 2, 1), generator=g)
@@ -212,7 +212,9 @@ def by_hand(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]
                 a2, log_prob2 = sample(o2, beta, next_noise[b, t, 0])
                 targets = []
                 for tt in tau_target[b, 0]:
-                    value = torch.minimum(z(0, o2, a2, tt, beta), z(1, o2, a2, tt, beta)) - 0.2 * log_prob2
+                    both = z(0, o2, a2, tt, beta), z(1, o2, a2, tt, beta)
+                    value = torch.minimum(*both) if over_critics == "minimum" else (both[0] + both[1]) / 2
+                    value = value - 0.2 * log_prob2
                     alive = 0.0 if batch["next", "terminated"][b, t, 0] else 1.0
                     targets.append(batch["next", "reward"][b, t, 0] + 0.9 * alive * value)
             q = torch.zeros(())
@@ -232,10 +234,11 @@ def by_hand(batch: TensorDictBase) -> tuple[dict[str, Tensor], dict[str, Tensor]
     return {key: torch.stack(value).view(2, 2) for key, value in out.items()}, p
 
 
-def test_losses_and_gradients_by_hand() -> None:
+@pytest.mark.parametrize("over_critics", ["minimum", "mean"])
+def test_losses_and_gradients_by_hand(over_critics: str) -> None:
     batch = linear_batch()
-    loss = linear_loss(reduction="none")
-    expected, p = by_hand(batch)
+    loss = linear_loss(reduction="none", target_over_critics=over_critics)
+    expected, p = by_hand(batch, over_critics)
     found = loss(batch)
     for key in LOSSES:
         torch.testing.assert_close(found[key], expected[key])
@@ -529,6 +532,7 @@ def test_state_dict_continues_bit_for_bit() -> None:
         ({"kappa": -1.0}, "above 0"),
         ({"burn_in": -1}, "at least 0"),
         ({"fractions_per": "batch"}, "'sequence' or 'transition'"),
+        ({"target_over_critics": "maximum"}, "'minimum' or 'mean'"),
         ({"loss_function": "l3"}, "'smooth_l1' or 'l2'"),
         ({"reduction": "median"}, "'mean', 'sum' or 'none'"),
     ],

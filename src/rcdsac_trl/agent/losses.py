@@ -4,7 +4,8 @@ Public names::
 
     DistributionalSACLoss(actor, critics, *, measure=None, num_quantiles=16, num_target_quantiles=16,
                           num_risk_samples=16, fractions_per="sequence", kappa=1.0, loss_function="smooth_l1",
-                          alpha_init=1.0, target_entropy=-2.0, burn_in=0, reduction="mean", generator=None)
+                          alpha_init=1.0, target_entropy=-2.0, burn_in=0, target_over_critics="minimum",
+                          reduction="mean", generator=None)
         forward(batch [B, L+1]) -> loss_actor, loss_qvalue, loss_alpha, alpha, entropy, td_error, q_value
                                    (, quantile_spread)
         .make_value_estimator(gamma=0.99)   .set_keys(...)   .rng_state (get and set; also in state_dict)
@@ -43,7 +44,8 @@ class DistributionalSACLoss(LossModule):
     - critic: :func:`~rcdsac_trl.agent.functional.quantile_huber_loss` at fractions
       :math:`\tau_i, \tau'_j \sim U(0,1)` between :math:`\hat Z_{\tau_i}(s_t, a_t; \beta)` and
       :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a; \beta) - \alpha \log\pi(a|s_{t+1},\beta))`,
-      with a policy action :math:`a` and the element-wise minimum over the target critics; summed over the critics;
+      with a policy action :math:`a` and the element-wise minimum (or mean) over the target critics; summed over the
+      critics;
     - actor: :math:`\alpha \log\pi - \min_k \frac1K \sum_j \hat Z^k_{\psi(\tau_j;\beta)}(s_t, a; \beta)`;
     - temperature: :math:`-\log\alpha \, (\log\pi + \bar H)`.
 
@@ -72,6 +74,8 @@ class DistributionalSACLoss(LossModule):
         alpha_init: temperature at the start, above 0.
         target_entropy: the entropy the temperature aims for, in nats.
         burn_in: number of leading transitions of a sequence that only warm the memory up and carry no loss.
+        target_over_critics: what the target takes of the target critics at each fraction. The minimum of two quantile
+            functions that disagree lowers *both* tails, and bootstrapping adds that up; the mean has no such bias.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``; over batch and time. ``"none"`` leaves every entry of the
             output ``[B, L - burn_in]``.
         generator: source of all random numbers; None for one seeded with 0. Its state is part of ``state_dict``.
@@ -140,6 +144,7 @@ class DistributionalSACLoss(LossModule):
         alpha_init: float = 1.0,
         target_entropy: float = -2.0,
         burn_in: int = 0,
+        target_over_critics: Literal["minimum", "mean"] = "minimum",
         reduction: Literal["mean", "sum", "none"] = "mean",
         generator: torch.Generator | None = None,
     ) -> None:
@@ -157,6 +162,8 @@ class DistributionalSACLoss(LossModule):
             raise ValueError(f"fractions_per = {fractions_per!r} must be 'sequence' or 'transition'")
         if loss_function not in ("smooth_l1", "l2"):
             raise ValueError(f"loss_function = {loss_function!r} must be 'smooth_l1' or 'l2'")
+        if target_over_critics not in ("minimum", "mean"):
+            raise ValueError(f"target_over_critics = {target_over_critics!r} must be 'minimum' or 'mean'")
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
         self._critics = tuple(critics)
@@ -177,6 +184,7 @@ class DistributionalSACLoss(LossModule):
         self.loss_function = loss_function
         self.target_entropy = target_entropy
         self.burn_in = burn_in
+        self.target_over_critics = target_over_critics
         self.reduction = reduction
         #: How much of beta counts in the actor's loss; the trainer lets it grow from 0 (as if neutral) to 1 (all).
         #: The networks are told the whole beta from the start, so that no value of it is ever new to them.
@@ -289,7 +297,8 @@ class DistributionalSACLoss(LossModule):
                 for critic in self._critics:
                     memory = self._encode(critic, tensordict)[:, 1:]
                     values.append(self._evaluate(critic, memory, action, tau, risk))
-            next_value = minimum(values) - self.alpha * log_prob.unsqueeze(-1)
+            next_value = minimum(values) if self.target_over_critics == "minimum" else torch.stack(values).mean(0)
+            next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
             # The estimator checks shapes strictly, so every target fraction gets its own entry.
             outcome = TensorDict(batch_size=batch.batch_size)
             keys = self.value_estimator.tensor_keys

@@ -15,6 +15,7 @@ from rcdsac_trl.world.task import TaskSettings
 Critic = Literal["quantile", "scalar"]
 Conditioning = Literal["per_episode", "fixed", "none"]
 Relabel = Literal["resample", "stored"]
+OverCritics = Literal["minimum", "mean"]
 DrawnPer = Literal["transition", "sequence"]
 
 
@@ -211,6 +212,7 @@ class LearnerSettings:
     fractions_per: DrawnPer
     kappa: float
     num_critics: int
+    target_over_critics: OverCritics
     gamma: float
     target_coefficient: float
     actor_average_decay: float
@@ -226,6 +228,7 @@ class LearnerSettings:
         """Refuse values that cannot work."""
         _at_least("learner", self, 1, "batch_size sequence_length num_quantiles num_target_quantiles num_risk_samples")
         _positive("learner", self, "kappa actor_lr critic_lr alpha_lr alpha_init")
+        _one_of("learner.target_over_critics", self.target_over_critics, OverCritics)
         _one_of("learner.resample_per", self.resample_per, DrawnPer)
         _one_of("learner.fractions_per", self.fractions_per, DrawnPer)
         if self.num_critics not in (1, 2):

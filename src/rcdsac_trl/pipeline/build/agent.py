@@ -41,6 +41,7 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
         alpha_init=learner.alpha_init,
         target_entropy=learner.target_entropy,
         burn_in=learner.burn_in,
+        target_over_critics=learner.target_over_critics,
         generator=torch_stream(settings.seed, "loss", device=device),
     ).to(device)
     loss.make_value_estimator(gamma=learner.gamma)
