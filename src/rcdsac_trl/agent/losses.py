@@ -75,7 +75,8 @@ class DistributionalSACLoss(LossModule):
         target_entropy: the entropy the temperature aims for, in nats.
         burn_in: number of leading transitions of a sequence that only warm the memory up and carry no loss.
         target_over_critics: what the target takes of the target critics at each fraction. The minimum of two quantile
-            functions that disagree lowers *both* tails, and bootstrapping adds that up; the mean has no such bias.
+            functions that disagree lowers *both* tails, and bootstrapping adds that up; the mean has no such bias, but
+            the policy then finds what both overestimate.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``; over batch and time. ``"none"`` leaves every entry of the
             output ``[B, L - burn_in]``.
         generator: source of all random numbers; None for one seeded with 0. Its state is part of ``state_dict``.
