@@ -2,6 +2,7 @@
 
 import copy
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from rcdsac_trl.agent.functional import _quantile_huber_pairwise, quantile_huber
 from rcdsac_trl.agent.losses import DistributionalSACLoss
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
+from rcdsac_trl.agent.targets import FusedSoftUpdate
 
 SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -476,18 +478,56 @@ def test_only_td0() -> None:
         linear_loss().make_value_estimator(ValueEstimators.TDLambda)
 
 
-def test_soft_update_moves_the_targets() -> None:
+@pytest.mark.parametrize("kind", [SoftUpdate, FusedSoftUpdate])
+def test_soft_update_moves_the_targets(kind: type[SoftUpdate]) -> None:
     loss = make_loss()
-    updater = SoftUpdate(loss, eps=0.9)
+    updater = kind(loss, eps=0.9)
     online, target = loss.critic_network_params, loss.target_critic_network_params
-    key = ("0", "module", "1", "module", "hidden", "weight")
     with torch.no_grad():
-        online[key].add_(1.0)
-    before = target[key].clone()
+        for parameter in online.parameters():
+            parameter.add_(1.0)
+    before = target.clone()
     updater.step()
-    torch.testing.assert_close(target[key], before + 0.1)
+    for key, parameter in online.items(True, True):
+        moved = 0.1 if isinstance(parameter, nn.Parameter) else 0.0  # the cosines' frequencies are no parameter
+        torch.testing.assert_close(target[key], before[key] + moved)
     out = loss(make_batch())
     assert torch.isfinite(out["loss_qvalue"])
+
+
+def _same(loss: DistributionalSACLoss) -> DistributionalSACLoss:
+    return loss
+
+
+def _restored(loss: DistributionalSACLoss) -> DistributionalSACLoss:
+    other = make_loss()
+    other.load_state_dict(loss.state_dict())
+    return other
+
+
+@pytest.mark.parametrize("made", [_same, _restored, copy.deepcopy, lambda loss: loss.double().float()])
+def test_targets_come_from_the_target_parameters(
+    made: Callable[[DistributionalSACLoss], DistributionalSACLoss],
+) -> None:
+    """Whatever has become of a loss, its target critics hold its target parameters, and they alone make targets."""
+    loss, batch = made(make_loss()), make_batch()
+
+    def target() -> Tensor:
+        loss.rng_state = torch.Generator().manual_seed(3).get_state()
+        return loss.compute_target(batch, loss.encode_actor(batch))
+
+    before = target()
+    for parameter in loss.critic_network_params.parameters():
+        parameter.data.mul_(1.5)
+    assert torch.equal(target(), before)
+    for key, parameter in loss.target_critic_network_params.items(True, True):
+        if "output" in key:
+            parameter.data.zero_()
+    log_prob_alone = target()
+    assert not torch.allclose(log_prob_alone, before)
+    assert torch.equal(log_prob_alone, log_prob_alone[..., :1].expand_as(before))
+    loss.actor_network_params["module", "1", "module", "output", "bias"].data.add_(1.0)
+    assert not torch.allclose(target(), log_prob_alone)
 
 
 def test_random_numbers_come_from_the_losses_generator() -> None:

@@ -4,15 +4,15 @@ Public names::
 
     quantile_huber_loss(quantiles [..,N], targets [..,N'], tau [..,N], kappa=1) -> [..]
     squash(loc, scale, noise) -> action, log_prob
-    call_head(head, entries) -> TensorDict
+    call_module(module, entries) -> what it writes, by its keys' order
     minimum(values) -> element-wise minimum
 """
 
 import math
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey, TensorDict
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -79,13 +79,19 @@ def squash(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     return raw.tanh(), log_prob.sum(-1)
 
 
-def call_head(head: TensorDictModuleBase, entries: dict[NestedKey, Tensor | None]) -> TensorDictBase:
-    """Run a head on the entries it reads; their time dimensions may be 1, so only the first is the batch's."""
-    memory = next(value for value in entries.values() if value is not None)
-    inputs = TensorDict(batch_size=memory.shape[:1])
-    for key in head.in_keys:
-        inputs.set(key, entries[key])
-    return head(inputs)
+def call_module(module: TensorDictModuleBase, entries: dict[NestedKey, Tensor | None]) -> tuple[Tensor, ...]:
+    """Run an encoder or a head on the entries it reads, and return what it writes, in the order of its keys.
+
+    The first dimension of the entries is the batch's; their time dimensions may be 1. A plain ``TensorDictModule``'s
+    network is called directly: TensorDicts of its inputs and outputs cost as much as a small batch's layers.
+    """
+    inputs = [entries[key] for key in module.in_keys]
+    if type(module) is TensorDictModule:
+        outputs = module.module(*inputs)
+        return outputs if isinstance(outputs, tuple) else (outputs,)
+    memory = next(value for value in inputs if value is not None)
+    written = module(TensorDict(dict(zip(module.in_keys, inputs, strict=True)), batch_size=memory.shape[:1]))
+    return tuple(written.get(key) for key in module.out_keys)
 
 
 def minimum(values: list[Tensor]) -> Tensor:

@@ -14,8 +14,10 @@ Public names::
         loss.log_alpha
 """
 
+import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -31,7 +33,7 @@ from torchrl.objectives.utils import (
     distance_loss,
 )
 
-from rcdsac_trl.agent.functional import call_head, minimum, quantile_huber_loss, squash
+from rcdsac_trl.agent.functional import call_module, minimum, quantile_huber_loss, squash
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
 
 
@@ -175,6 +177,9 @@ class DistributionalSACLoss(LossModule):
         # One functional module for all critics: their parameters keep apart (a list given to TorchRL's own
         # conversion is stacked, which a recurrent layer without vmap cannot use).
         self.convert_to_functional(nn.ModuleList(critics), "critic_network", create_target_params=True)
+        # In a tuple, so that their parameters are not listed as this module's own a second time.
+        self._target_critics = tuple(copy.deepcopy(critic) for critic in critics)
+        self._link()
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
         self.measure = measure or Neutral()
         self.num_quantiles = num_quantiles
@@ -253,6 +258,28 @@ class DistributionalSACLoss(LossModule):
         """The temperature, detached."""
         return self.log_alpha.detach().exp()
 
+    def _link(self) -> None:
+        """Let the modules hold the loss's parameters for good, the target critics those of the targets.
+
+        TorchRL's idiom lends a module its parameters for every call; with recurrent networks of small batches, that
+        costs more than some of their layers. Whatever makes new tensors calls this again.
+        """
+        self.actor_network_params.to_module(self.actor_network)
+        self.critic_network_params.to_module(self.critic_network)
+        params = self._modules["target_critic_network_params"]  # the attribute warns before there is an updater
+        params.to_module(nn.ModuleList(self._target_critics))
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "DistributionalSACLoss":
+        """Move or cast the parameters, as :meth:`torch.nn.Module.to` does."""
+        super()._apply(fn)
+        self._link()
+        return self
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of a copied or pickled loss."""
+        super().__setstate__(state)
+        self._link()
+
     # ------------------------------------------------------------------------------------------- the losses
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the three losses and detached diagnostics of a batch ``[B, L+1]``.
@@ -284,8 +311,7 @@ class DistributionalSACLoss(LossModule):
                 f"expected a batch [sequences, steps + 1] with more than burn_in = {self.burn_in} steps, "
                 f"got {list(tensordict.shape)}"
             )
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            return self._encode(self.actor_network, tensordict)
+        return self._encode(self.actor_network, tensordict)
 
     def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor) -> Tensor:
         """Return the target samples ``[B, L - burn_in, N']`` (scalar critics: N' = 1), without gradient."""
@@ -293,11 +319,11 @@ class DistributionalSACLoss(LossModule):
         with torch.no_grad():
             action, log_prob = self._act(actor_memory[:, 1:], risk)
             tau = self._fractions(self.num_target_quantiles, log_prob)
-            with self.target_critic_network_params.to_module(self.critic_network, preserve_module_state=False):
-                values = []
-                for critic in self._critics:
-                    memory = self._encode(critic, tensordict)[:, 1:]
-                    values.append(self._evaluate(critic, memory, action, tau, risk))
+            _ = self.target_critic_network_params  # TorchRL warns here where nothing updates them
+            values = []
+            for critic in self._target_critics:
+                memory = self._encode(critic, tensordict)[:, 1:]
+                values.append(self._evaluate(critic, memory, action, tau, risk))
             next_value = minimum(values) if self.target_over_critics == "minimum" else torch.stack(values).mean(0)
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
             # The estimator checks shapes strictly, so every target fraction gets its own entry.
@@ -319,13 +345,12 @@ class DistributionalSACLoss(LossModule):
         target = self.compute_target(tensordict, actor_memory)
         action, risk = self._transitions(tensordict).get(self.tensor_keys.action), self._risk(tensordict)
         tau = self._fractions(self.num_quantiles, action)
-        with self.critic_network_params.to_module(self.critic_network, preserve_module_state=False):
-            # No transition starts at the last observation.
-            memories = [self._encode(critic, tensordict[:, :-1]) for critic in self._critics]
-            values = [
-                self._evaluate(critic, memory, action, tau, risk)
-                for critic, memory in zip(self._critics, memories, strict=True)
-            ]
+        # No transition starts at the last observation.
+        memories = [self._encode(critic, tensordict, stop=-1) for critic in self._critics]
+        values = [
+            self._evaluate(critic, memory, action, tau, risk)
+            for critic, memory in zip(self._critics, memories, strict=True)
+        ]
         if tau is None:
             errors = [distance_loss(value, target, self.loss_function).squeeze(-1) for value in values]
         else:
@@ -341,7 +366,7 @@ class DistributionalSACLoss(LossModule):
         tau = self._fractions(self.num_risk_samples, log_prob)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
-        with self.critic_network_params.detach().to_module(self.critic_network, preserve_module_state=False):
+        with _frozen(self._critics):
             values = [
                 self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
                 for critic, memory in zip(self._critics, critic_memories, strict=True)
@@ -349,9 +374,9 @@ class DistributionalSACLoss(LossModule):
         return self.alpha * log_prob - minimum(values), log_prob.detach()
 
     # ------------------------------------------------------------------------------------------- parts of them
-    def _encode(self, network: TensorDictSequential, tensordict: TensorDictBase) -> Tensor:
+    def _encode(self, network: TensorDictSequential, tensordict: TensorDictBase, stop: int | None = None) -> Tensor:
         encoder = network[0]
-        memory = encoder(tensordict.select(*encoder.in_keys)).get(encoder.out_keys[0])
+        (memory,) = call_module(encoder, {key: tensordict.get(key)[:, :stop] for key in encoder.in_keys})
         return memory[:, self.burn_in :]
 
     def _transitions(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -368,10 +393,8 @@ class DistributionalSACLoss(LossModule):
         return risk[:, :1] if risk.stride(1) == 0 else risk
 
     def _act(self, memory: Tensor, risk: Tensor | None) -> tuple[Tensor, Tensor]:
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            entries = {self.actor_network[0].out_keys[0]: memory, self.tensor_keys.risk: risk}
-            policy = call_head(self.actor_network[1], entries)
-        loc, scale = (policy.get(key) for key in self.actor_network[1].out_keys)
+        entries = {self.actor_network[0].out_keys[0]: memory, self.tensor_keys.risk: risk}
+        loc, scale = call_module(self.actor_network[1], entries)
         noise = torch.randn(loc.shape, generator=self._generator, device=self._generator.device)
         return squash(loc, scale, noise.to(loc))
 
@@ -384,7 +407,7 @@ class DistributionalSACLoss(LossModule):
             self.tensor_keys.tau: tau,
             self.tensor_keys.risk: risk,
         }
-        return call_head(critic[1], entries).get(critic[1].out_keys[0])
+        return call_module(critic[1], entries)[0]
 
     def _fractions(self, number: int, like: Tensor) -> Tensor | None:
         """Draw fractions ``[B, L or 1, number]`` for a tensor ``[B, L, ..]``; None for scalar critics."""
@@ -401,3 +424,16 @@ class DistributionalSACLoss(LossModule):
             if self._distributional:
                 diagnostics["quantile_spread"] = stacked.std(-1, correction=0).mean(0)
             return diagnostics
+
+
+@contextmanager
+def _frozen(modules: Sequence[nn.Module]) -> Iterator[None]:
+    """Let no gradient flow to what the modules hold, within a block."""
+    parameters = [p for module in modules for p in module.parameters() if p.requires_grad]
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in parameters:
+            parameter.requires_grad_(True)

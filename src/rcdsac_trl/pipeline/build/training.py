@@ -13,6 +13,7 @@ from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import LossModule, SoftUpdate
 
+from rcdsac_trl.agent.targets import FusedSoftUpdate
 from rcdsac_trl.pipeline import logs, runtime
 from rcdsac_trl.pipeline.build.agent import (
     make_average,
@@ -76,7 +77,7 @@ def make_learner(settings: TrainingSettings, device: str) -> Learner:
         loss=loss,
         relabel=make_relabel(settings, device),
         optimizer=make_optimizer(loss, settings.learner),
-        targets=SoftUpdate(loss, tau=settings.learner.target_coefficient),
+        targets=FusedSoftUpdate(loss, tau=settings.learner.target_coefficient),
         clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],
         max_grad_norm=settings.learner.max_grad_norm,
         average=make_average(loss, settings.learner),
