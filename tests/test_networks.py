@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -21,6 +21,7 @@ from rcdsac_trl.agent.networks import (
     ScalarHead,
     Widths,
 )
+from rcdsac_trl.agent.recurrent_kernels import _GatedRecurrence, gated_recurrence
 from rcdsac_trl.agent.risk import CVaR, PowerLaw
 from rcdsac_trl.errors import UserInputError
 
@@ -72,6 +73,22 @@ def test_silent_bins_are_left_out() -> None:
     # Bin 0 reaches position 0, bin 14 reaches 2 and 3; the one between costs nothing.
     assert kernels._heard(torch.eye(180)[[0, 14]], 5) == [(0, 4)]
     assert kernels._heard(0.0 * bins, 5) == [(0, 1)]
+
+
+@pytest.mark.parametrize(("rows", "steps"), [(1, 1), (1, 4), (3, 1), (5, 6)])
+def test_gated_recurrence_equals_torchs(rows: int, steps: int) -> None:
+    gru = nn.GRU(7, 5, batch_first=True).double()
+    inputs = torch.randn(rows, steps, 7, dtype=torch.float64, requires_grad=True)
+    fast, plain = gated_recurrence(inputs, gru), gru(inputs)[0]
+    torch.testing.assert_close(fast, plain)
+    learned = [inputs, *gru.parameters()]
+    torch.testing.assert_close(gradients(fast, learned), gradients(plain, learned))
+
+
+def test_gated_recurrence_against_finite_differences() -> None:
+    gru = nn.GRU(3, 2, batch_first=True).double()
+    inputs = torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(_GatedRecurrence.apply, (inputs, *gru.parameters()))
 
 
 def quantile_head(steps: int, tau_steps: int, risk_steps: int, *, frozen: bool) -> tuple[QuantileHead, list[Tensor]]:

@@ -268,6 +268,7 @@ class DistributionalSACLoss(LossModule):
         self.critic_network_params.to_module(self.critic_network)
         params = self._modules["target_critic_network_params"]  # the attribute warns before there is an updater
         params.to_module(nn.ModuleList(self._target_critics))
+        self._head_parameters = tuple(p for critic in self._critics for p in critic[1].parameters() if p.requires_grad)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "DistributionalSACLoss":
         """Move or cast the parameters, as :meth:`torch.nn.Module.to` does."""
@@ -366,7 +367,7 @@ class DistributionalSACLoss(LossModule):
         tau = self._fractions(self.num_risk_samples, log_prob)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
-        with _frozen(self._critics):
+        with _frozen(self._head_parameters):
             values = [
                 self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
                 for critic, memory in zip(self._critics, critic_memories, strict=True)
@@ -427,9 +428,8 @@ class DistributionalSACLoss(LossModule):
 
 
 @contextmanager
-def _frozen(modules: Sequence[nn.Module]) -> Iterator[None]:
-    """Let no gradient flow to what the modules hold, within a block."""
-    parameters = [p for module in modules for p in module.parameters() if p.requires_grad]
+def _frozen(parameters: tuple[nn.Parameter, ...]) -> Iterator[None]:
+    """Let no gradient flow to the parameters from what is computed within a block."""
     for parameter in parameters:
         parameter.requires_grad_(False)
     try:

@@ -31,6 +31,7 @@ from torch.nn import functional as F
 
 from rcdsac_trl.agent.kernels import range_features
 from rcdsac_trl.agent.quantile_kernels import quantile_values
+from rcdsac_trl.agent.recurrent_kernels import gated_recurrence
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 
@@ -129,6 +130,8 @@ class Encoder(nn.Module):
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
         """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
         features = self._features(range_, vectors)
+        if _runs_kernels(features) and torch.is_grad_enabled():
+            return gated_recurrence(features, self.gru)
         return self.gru(features)[0]
 
     def step(self, range_: Tensor, *rest: Tensor) -> Tensor:
