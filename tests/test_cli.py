@@ -279,7 +279,7 @@ def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
 
 def test_a_refusal_of_the_real_program(tmp_path: Path) -> None:
     process = start(tmp_path, "rcdsac_trl.train", POW, "learner.batch_size=abc")
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=300)
     assert (process.returncode, out) == (2, "")
     assert err == "rcdsac_trl: learner.batch_size=abc must be a whole number\n"
     assert list(tmp_path.iterdir()) == []
@@ -294,7 +294,7 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
     cwd.mkdir()
     sizes = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1"]
     process = start(cwd, "rcdsac_trl.evaluate", *given, *sizes, "out=there")
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     assert "Traceback" not in err
     assert "collisions_mean" in out
@@ -309,13 +309,13 @@ def interrupt(folder: Path, *arguments: str) -> tuple[int, str]:
     endless = [*TINY, "schedule.iterations=100000", "validation.every_iterations=100000", *arguments]
     process = start(folder, "rcdsac_trl.train", POW, *endless, f"hydra.run.dir={folder / 'run'}")
     log = folder / "run" / "train.log"
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while process.poll() is None and time.monotonic() < deadline:
         if log.exists() and "   2/100000" in log.read_text():  # the first one is saved then
             break
         time.sleep(0.1)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the whole group, workers included
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     return process.returncode, err
 
 

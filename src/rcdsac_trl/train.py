@@ -1,10 +1,14 @@
 """Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``; go on: ``.. resume=runs/<folder>``."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from rcdsac_trl.pipeline.cli import entry_point
+
+if TYPE_CHECKING:
+    from rcdsac_trl.pipeline.trainer import Trainer
 
 
 def check(cfg: DictConfig) -> None:
@@ -32,7 +36,7 @@ def continue_run(overrides: list[str], multirun: bool) -> bool:
     if trainer is None:
         print(f"{folder} is finished: nothing is left to do")
     else:
-        trainer.run()
+        _run(trainer)
     return True
 
 
@@ -41,7 +45,14 @@ def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
     from rcdsac_trl.pipeline import build
 
-    build.trainer(cfg, build.run_folder()).run()
+    _run(build.trainer(cfg, build.run_folder()))
+
+
+def _run(trainer: "Trainer") -> None:
+    from rcdsac_trl.pipeline.interrupts import at_safe_points
+
+    with at_safe_points():
+        trainer.run()
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.drivers import Rows
+from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.metrics import METRICS, Condition, episode_metrics, summarise
 
 # What an episode's row needs; everything else of a step is dropped at once.
@@ -38,6 +39,7 @@ def run_episodes(env: EnvBase, policy: TensorDictModuleBase, steps: int, episode
     tensordict = env.reset() if episode is None else env.reset(episode=episode)
     kept = []
     for _ in range(steps):
+        interruption_point()
         tensordict = env.step(policy(tensordict))
         kept.append(tensordict.select(*_KEPT).flatten())
         tensordict = env.step_mdp(tensordict)

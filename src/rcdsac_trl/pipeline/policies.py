@@ -8,6 +8,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules.distributions.utils import safetanh_noeps
 
 from rcdsac_trl.agent.actor import STATE_KEY
+from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.world.pursuit import pursuit_action
 
@@ -103,6 +104,7 @@ class CollectionPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` and the agent's other outputs, which stay the agent's own while pursuit drives."""
+        interruption_point()
         tensordict = self.policy(tensordict)
         if self._pursuing:
             action = pursuit_action(tensordict["waypoint"])

@@ -20,6 +20,7 @@ from rcdsac_trl.pipeline.checkpoint import Checkpoints
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.guard import FiniteGuard
+from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics, validation_score
 from rcdsac_trl.pipeline.replay import SequenceReplay
@@ -95,6 +96,7 @@ class Learner:
             group["lr"] = learning_rate_share * learning_rate
         sums: dict[str, Tensor] = {}
         for _ in range(number):
+            interruption_point()
             for key, value in self.update().items():
                 sums[key] = sums[key] + value if key in sums else value.clone()
         return {key: (value / number).item() for key, value in sums.items()}
