@@ -53,14 +53,18 @@ def test_rows_without_beta_have_their_own_labels() -> None:
 
 def test_the_best_checkpoint_has_the_highest_mean_over_the_conditions() -> None:
     # 8.5, 70 and 40 over both betas, however many episodes a beta has.
-    assert best_updates(TWO_BETAS) == 200
+    no_contact = TWO_BETAS.assign(contact_fraction=0.0)
+    assert best_updates(no_contact, 1000) == 200
+    # A step in contact counts as much as a reward of 1: 40 in each of these episodes.
+    leaning = no_contact.assign(contact_fraction=no_contact["updates"].map({100: 0.0, 200: 0.04, 300: 0.0}))
+    assert best_updates(leaning, 1000) == 300
     # Of equal scores the first stays, as in training.
-    assert best_updates(validation(-1.0, NAN, {5: [3.0], 9: [3.0]})) == 5
+    assert best_updates(validation(-1.0, NAN, {5: [3.0], 9: [3.0]}), 1000) == 5
 
 
 @pytest.mark.parametrize(("table", "lines"), [(None, 1), (TWO_BETAS, 4)])  # training, two betas, the best checkpoint
 def test_every_panel_shows_every_curve(table: pd.DataFrame | None, lines: int) -> None:
-    figure = learning_curve("title", TRAINING, table)
+    figure = learning_curve("title", TRAINING, table, 1000)
     *panels, legend = figure.axes
     assert [axes.get_title(loc="left") for axes in panels] == list(PANELS.values())
     assert {len(axes.get_lines()) for axes in panels} == {lines}
@@ -70,7 +74,7 @@ def test_every_panel_shows_every_curve(table: pd.DataFrame | None, lines: int) -
 def test_a_disastrous_iteration_does_not_flatten_the_reward() -> None:
     steady = validation(NAN, NAN, {updates: [300.0, 302.0] for updates in range(1, 61)})
     spoilt = steady.assign(reward=steady["reward"].where(steady["updates"] != 2, -1000.0))
-    low, high = learning_curve("title", spoilt, None).axes[0].get_ylim()
+    low, high = learning_curve("title", spoilt, None, 1000).axes[0].get_ylim()
     assert 290.0 < low < 301.0 < high < 310.0
 
 
@@ -78,7 +82,9 @@ def test_a_disastrous_iteration_does_not_flatten_the_reward() -> None:
 def run(tmp_path: Path) -> Path:
     folder = tmp_path / "run"
     folder.mkdir()
-    (folder / "config.yaml").write_text("algo: {name: sac}\nsensor: {name: full}\nseed: 3\n")
+    (folder / "config.yaml").write_text(
+        "algo: {name: sac}\nsensor: {name: full}\nseed: 3\ntask: {episode_steps: 1000}\n"
+    )
     TRAINING.to_csv(folder / "training_episodes.csv", index=False)
     return folder
 

@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.pipeline.metrics import validation_score
 
 PANELS: Mapping[str, str] = {
     "reward": "reward per episode",
@@ -74,28 +75,31 @@ def validation_curves(episodes: pd.DataFrame) -> list[Curve]:
     return curves
 
 
-def best_updates(episodes: pd.DataFrame) -> int:
+def best_updates(episodes: pd.DataFrame, episode_steps: int) -> int:
     """Return the number of updates at which training saved its best checkpoint.
 
     Args:
         episodes: as for :func:`validation_curves`.
+        episode_steps: length of an episode.
     """
     # As the trainer does it: every condition counts the same, and only a higher score replaces the best.
-    by_condition = episodes.groupby(["updates", *_CONDITIONS], dropna=False)["reward"].mean()
-    scores = by_condition.groupby("updates").mean()
-    return int(scores.index.to_numpy()[scores.to_numpy().argmax()])
+    by_condition = episodes.groupby(["updates", *_CONDITIONS], dropna=False)[list(PANELS)].mean()
+    numbers = by_condition.index.unique("updates").to_numpy()
+    scores = [validation_score(by_condition.loc[[number]], episode_steps) for number in numbers]
+    return int(numbers[scores.index(max(scores))])
 
 
-def learning_curve(title: str, training: pd.DataFrame, validation: pd.DataFrame | None) -> Figure:
+def learning_curve(title: str, training: pd.DataFrame, validation: pd.DataFrame | None, episode_steps: int) -> Figure:
     """Return the figure of one run.
 
     Args:
         title: what stands above the panels.
         training: ``training_episodes.csv``.
         validation: ``validation_episodes.csv``; None before the first validation.
+        episode_steps: length of an episode.
     """
     curves = [] if validation is None else validation_curves(validation)
-    best = None if validation is None else best_updates(validation)
+    best = None if validation is None else best_updates(validation, episode_steps)
     faint = Curve("training episodes", _FAINT, "", _means(training))
     figure = Figure(figsize=(11.0, 6.2), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=13, color=_INK)
@@ -121,6 +125,7 @@ def draw_run(folder: Path, out: Path) -> None:
         f"{trained.algo.name}, sensor {trained.sensor.name}, seed {trained.seed}",
         pd.read_csv(folder / "training_episodes.csv"),
         pd.read_csv(validation) if validation.is_file() else None,
+        trained.task.episode_steps,
     )
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=130)
