@@ -53,25 +53,14 @@ def main() -> None:
             "updates": Clock(trainer.learner.updates),
             "validation": Clock(trainer.validate),
             "checkpoints": Clock(trainer.checkpoints.save),
-            "collection": Clock(iter(trainer.collector).__next__),
+            "collection": Clock(trainer.episodes.collect),
             "replay_insertion": Clock(trainer.learner.replay.add_episodes),
         }
         trainer.learner.updates = parts["updates"]
         trainer.validate = parts["validation"]
         trainer.checkpoints.save = parts["checkpoints"]
         trainer.learner.replay.add_episodes = parts["replay_insertion"]
-        collector = trainer.collector
-        collect = parts["collection"]
-
-        class Timed:
-            def __iter__(self) -> Any:
-                for _ in range(options.iterations):
-                    yield collect()
-
-            def __getattr__(self, name: str) -> Any:
-                return getattr(collector, name)
-
-        trainer.collector = Timed()
+        trainer.episodes.collect = parts["collection"]
         wall = bench.wall_seconds(trainer.run)
     total = sum(clock.seconds for clock in parts.values())
     results: dict[str, Any] = {"cores": len(bench.cores()), "startup_seconds": startup, "wall_seconds": wall}

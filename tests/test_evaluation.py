@@ -374,7 +374,7 @@ def test_a_validation_repeats_itself_and_follows_the_agent(tmp_path: Path) -> No
     assert not trainer.validate()["reward"].equals(first["reward"])
     trainer.validate.close()
     trainer.validate.close()  # once more does no harm
-    trainer.collector.shutdown()
+    trainer.episodes.close()
     trainer.log.close()
     trainer.lock.close()
 

@@ -1,9 +1,11 @@
 """The training loop: what it counts, when it looks and saves, and that training is real, for every row."""
 
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +19,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.build.agent import make_loss
 from rcdsac_trl.pipeline.checkpoint import load_weights
+from rcdsac_trl.pipeline.collection import Episodes
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS
 from rcdsac_trl.pipeline.saved import Progress, load_progress
@@ -25,22 +28,30 @@ from rcdsac_trl.pipeline.trainer import LOSS_KEYS, Learner, Trainer
 from rcdsac_trl.world import episode
 from rcdsac_trl.world.env import NavigationEnv, make_env
 from rcdsac_trl.world.shapes import Map
+from rcdsac_trl.world.workers import WorkerError
 from tiny import AGENTS, ITERATIONS, ROWS, STEPS, UPDATES, evaluate, evaluation_betas, tiny_settings, tiny_trainer
 
 METRIC_COLUMNS = list(METRICS)
 
 
 # ------------------------------------------------------------------------------------------------ the loop, with stubs
+FAULTY: set[int] = set()
+"""Maps on which a worker of the stubs dies."""
+
+
 class Collector:
     """Yields episodes whose reward says which iteration they are from."""
 
-    def __init__(self, events: list[Any]) -> None:
+    def __init__(self, events: list[Any], iteration: int, map_index: int) -> None:
         self.events = events
+        self.iteration = iteration
+        self.map_index = map_index
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        iteration = 0
-        while True:
-            self.events.append(("collect", iteration))
+        for iteration, map_index in zip(count(self.iteration), count(self.map_index), strict=False):
+            self.events.append(("collect", iteration, map_index))
+            if map_index in FAULTY:
+                raise WorkerError("worker process 1 of 1 was killed by SIGKILL")
             components = torch.zeros(1, 2, 4, 5)
             components[:, 0, :, 1] = iteration
             components[:, 1, :, 1] = 10.0 * iteration
@@ -54,7 +65,6 @@ class Collector:
             risk = torch.tensor([-1.0, -2.0]).view(1, 2, 1, 1).expand(1, 2, 4, 1)
             # One worker with two agents, four steps: [workers, agents, time].
             yield TensorDict({"risk": risk, "next": after}, batch_size=[1, 2, 4])
-            iteration += 1
 
     def shutdown(self, raise_on_error: bool = True) -> None:
         assert not raise_on_error
@@ -91,8 +101,10 @@ class StubValidation:
         self.steps = 4
 
     def __call__(self) -> pd.DataFrame:
-        score = next(self.scores)
         self.events.append("validate")
+        score = next(self.scores)
+        if math.isnan(score):
+            raise WorkerError("worker process 1 of 1 gave no answer within 1 s")
         rows = pd.DataFrame({"beta": [-2.0, -2.0, -1.0], "collision_weight": [math.nan] * 3})
         # Conditions count alike, however many episodes they have.
         rows[METRIC_COLUMNS] = 0.0
@@ -159,13 +171,18 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
         "checkpoint_every": 100,
         "interrupt_in": None,
         "fail_in": None,
+        "max_restarts": 3,
         "progress": Progress(),
     } | changes
     return Trainer(
         schedule=Schedule(**schedule | changes.get("schedule", {})),
         progress=parts["progress"],
-        collector=Collector(events),  # type: ignore[arg-type]
-        set_iteration=lambda iteration: events.append(("iteration", iteration)),
+        episodes=Episodes(
+            lambda iteration, map_index: Collector(events, iteration, map_index),  # type: ignore[arg-type,return-value]
+            lambda iteration: events.append(("iteration", iteration)),
+            iteration=parts["progress"].iterations,
+            map_index=parts["progress"].iterations + parts["progress"].skipped_maps,
+        ),
         learner=StubLearner(events, parts["interrupt_in"]),
         guard=StubGuard(events, parts["fail_in"]),  # type: ignore[arg-type]
         validate=StubValidation(events, parts["scores"]),  # type: ignore[arg-type]
@@ -174,6 +191,7 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
         checkpoint_every=parts["checkpoint_every"],
         log=RunLog(folder, []),
         lock=StubLock(events),  # type: ignore[arg-type]
+        max_restarts=parts["max_restarts"],
         context_key="risk",
     )
 
@@ -225,7 +243,7 @@ def test_each_iteration_is_told_before_its_episodes_and_its_updates_get_its_stre
     events: list[Any] = []
     stub_trainer(tmp_path, events).run()
     assert [event[1] for event in kinds(events, "iteration")] == [0, 1, 2, 3, 4]
-    told = [event for event in events if event[0] in ("iteration", "collect")]
+    told = [event[:2] for event in events if event[0] in ("iteration", "collect")]
     assert told == [(kind, iteration) for iteration in range(5) for kind in ("iteration", "collect")]
     # one neutral iteration, then a ramp of two; the learning rates fall in the last two
     assert [event[1] for event in kinds(events, "update")] == [3] * 5
@@ -260,7 +278,7 @@ def test_ctrl_c_drops_the_iteration_and_closes_everything(tmp_path: Path) -> Non
         trainer.run()
     assert [event[1].iterations for event in kinds(events, "save")] == [0, 1, 2]
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
-    told = f"interrupted in iteration 2; 2 are saved, resume={tmp_path} continues there"
+    told = f"interrupted in iteration 2; 2 iterations are saved, resume={tmp_path} continues there"
     assert told in (tmp_path / "train.log").read_text().splitlines()
 
 
@@ -527,7 +545,8 @@ def test_workers_do_not_change_a_run(
     """Workers in this process: the same code with the same shapes, without the time that processes take."""
     monkeypatch.setattr("rcdsac_trl.pipeline.build.world.make_env", partial(make_env, serial=True))
     trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", f"world.num_workers={workers}")
-    assert trainer.collector.env.batch_size == torch.Size([workers, AGENTS // workers])
+    assert trainer.episodes._collector is not None
+    assert trainer.episodes._collector.env.batch_size == torch.Size([workers, AGENTS // workers])
     trainer.run()
     assert_equal_runs(tiny_run, tmp_path / "run")
 
@@ -536,6 +555,67 @@ def test_workers_do_not_change_a_run(
 def test_worker_processes_do_not_change_a_run(tiny_run: Path, tmp_path: Path) -> None:
     tiny_trainer(tmp_path / "run", "rcdsac_pow", "world.num_workers=2").run()
     assert_equal_runs(tiny_run, tmp_path / "run")
+
+
+@pytest.fixture
+def faulty() -> Iterator[set[int]]:
+    yield FAULTY
+    FAULTY.clear()
+
+
+def test_an_iteration_whose_workers_fail_is_driven_on_the_next_map(tmp_path: Path, faulty: set[int]) -> None:
+    events: list[Any] = []
+    faulty.update([1, 4, 5])
+    stub_trainer(tmp_path, events, checkpoint_every=1).run()
+    # What fails is neither stored nor counted, and every later iteration is one map further on.
+    assert [event[1:] for event in kinds(events, "collect")] == [
+        (0, 0), (1, 1), (1, 2), (2, 3), (3, 4), (3, 5), (3, 6), (4, 7),
+    ]  # fmt: skip
+    assert [event[1] for event in kinds(events, "iteration")] == [0, 1, 1, 2, 3, 3, 3, 4]
+    assert events.count("store") == 5
+    saved = [event[1] for event in kinds(events, "save")]
+    assert [(p.iterations, p.steps, p.restarts, p.skipped_maps) for p in saved] == [
+        (0, 0, 0, 0), (1, 8, 0, 0), (2, 16, 1, 1), (3, 24, 1, 1), (4, 32, 3, 3), (5, 40, 3, 3),
+    ]  # fmt: skip
+    told = (tmp_path / "train.log").read_text().splitlines()
+    assert told[2:4] == [
+        "iteration 1, training map 1: worker process 1 of 1 was killed by SIGKILL; restart 1 of at most 3",
+        "the episodes on map 1 are dropped: iteration 1 drives on the next",
+    ]
+    # A run that is continued goes on behind the maps that were given up.
+    events.clear()
+    trainer = stub_trainer(tmp_path, events, progress=replace(saved[2]))
+    trainer.run()
+    assert kinds(events, "collect")[0] == ("collect", 2, 3)
+
+
+def test_a_validation_whose_workers_fail_begins_again(tmp_path: Path) -> None:
+    events: list[Any] = []
+    stub_trainer(tmp_path, events, scores=[1.0, math.nan, math.nan, 2.0], validate_every=2, checkpoint_every=1,
+                 schedule={"iterations": 4}).run()  # fmt: skip
+    assert events.count("validate") == 4
+    last = kinds(events, "save")[-1][1]
+    assert (last.best_score, last.best_iterations, last.restarts, last.skipped_maps) == (2.0, 4, 2, 0)
+    assert (
+        "iteration 3, validation: worker process 1 of 1 gave no answer within 1 s; restart 2 of at most 3"
+        in (tmp_path / "train.log").read_text()
+    )
+
+
+def test_workers_that_fail_too_often_end_a_run(tmp_path: Path, faulty: set[int]) -> None:
+    events: list[Any] = []
+    faulty.update([2, 3])
+    trainer = stub_trainer(tmp_path, events, checkpoint_every=1, max_restarts=1)
+    told = (
+        "iteration 2, training map 3: worker process 1 of 1 was killed by SIGKILL; world.max_restarts=1 allows no "
+        f"further restart: training stops; 2 iterations are saved, resume={tmp_path} continues there"
+    )
+    with pytest.raises(TrainingError, match=re.escape(told)):
+        trainer.run()
+    assert [event[1].iterations for event in kinds(events, "save")] == [0, 1, 2]
+    assert events[-2:] == ["validation closed", "lock open"]
+    assert events.count("collector closed") == 2
+    assert (tmp_path / "train.log").read_text().splitlines()[-1] == told
 
 
 # ------------------------------------------------------------------------------------------------ maps and episodes
@@ -588,7 +668,8 @@ def test_every_validation_sees_the_same_maps_whatever_the_seed_of_the_run(tmp_pa
 def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: Path) -> None:
     settings = tiny_settings()
     trainer = tiny_trainer(tmp_path / "run")
-    for iteration, batch in enumerate(trainer.collector):
+    for iteration in range(ITERATIONS):
+        batch = trainer.episodes.collect(iteration, iteration)
         assert batch.batch_size == torch.Size([AGENTS, STEPS])
         fresh = NavigationEnv(settings.map, settings.task, seed=0, agent_ids=range(AGENTS), first_episode=iteration)
         start = fresh.reset()
@@ -600,7 +681,7 @@ def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: P
         assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * (STEPS - 1) + [True]] * AGENTS
         # What is told stays for the whole episode.
         assert (batch["risk"] == batch["risk"][:, :1]).all()
-    trainer.collector.shutdown()
+    trainer.episodes.close()
     trainer.validate.close()
     trainer.log.close()
     trainer.lock.close()

@@ -1,4 +1,4 @@
-"""The exceptions whose message is the sentence a user reads: wrong input, and a training that cannot go on."""
+"""The exceptions whose message is the sentence a user reads: wrong input, and work that cannot go on."""
 
 
 class UserInputError(ValueError):
@@ -9,8 +9,12 @@ class UserInputError(ValueError):
     """
 
 
-class TrainingError(RuntimeError):
-    """A training that cannot go on, through no fault of the input.
+class FaultError(RuntimeError):
+    """Work that cannot go on, through no fault of the input.
 
     The message is one sentence that says what happened and where to look. Entry points print it and exit with code 1.
     """
+
+
+class TrainingError(FaultError):
+    """A training that cannot go on; its last checkpoint is what it was."""

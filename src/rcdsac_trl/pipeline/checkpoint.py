@@ -19,6 +19,9 @@ from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.saved import Name, Progress, Saved, find, folder_name, folders, record_or_none, write_record
 
+# What a checkpoint holds beside its tensors.
+_ROOM_BYTES = 1 << 20
+
 
 class Generators:
     """Named random generators as one component with a ``state_dict``."""
@@ -54,6 +57,7 @@ class Checkpoints:
         self.replay = replay
         self.keep = keep
         self.saved_iterations: int | None = None
+        self._components = dict(components)
         self._checkpoint = Checkpoint()
         for name, component in components.items():
             # One file for all tensors of a component: a checkpoint is soon on the disk, and soon hashed.
@@ -71,12 +75,18 @@ class Checkpoints:
         segments = [] if self.replay is None else self.replay.save()
         path = self.folder / folder_name(progress.iterations)
         temporary = durable.unfinished(path)
+        # TorchRL writes tensors through memory.
+        durable.reserve(self.folder, self.size_bytes() + _ROOM_BYTES)
         self._checkpoint.save(temporary)
         write_record(temporary, progress, segments, logs)
         durable.publish(path)
         self.saved_iterations = progress.iterations
         self._rotate()
         return path
+
+    def size_bytes(self) -> int:
+        """Return how many bytes the tensors of all components have now; optimisers get theirs at their first step."""
+        return sum(_tensor_bytes(component.state_dict()) for component in self._components.values())
 
     def restore(self, saved: Saved) -> None:
         """Load a checkpoint that is whole, and forget everything that was saved after it.
@@ -126,6 +136,13 @@ def load_weights(
     wanted = {"loss": loss, "average": average}
     _load(Checkpoint(**{key: module for key, module in wanted.items() if module is not None}), saved.path)
     return damaged
+
+
+def _tensor_bytes(state: Any) -> int:
+    if isinstance(state, torch.Tensor):
+        return state.nbytes
+    values: Any = state.values() if isinstance(state, Mapping) else state if isinstance(state, list | tuple) else ()
+    return sum(_tensor_bytes(value) for value in values)
 
 
 def _load(checkpoint: Checkpoint, path: Path) -> None:

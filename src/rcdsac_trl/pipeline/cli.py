@@ -18,8 +18,9 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.errors import TrainingError, UserInputError
+from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.paths import CONF_DIR
+from rcdsac_trl.pipeline.resources import fault_sentence
 from rcdsac_trl.pipeline.runtime import keep_pages, quiet_libraries
 from rcdsac_trl.pipeline.typed import unknown_key
 
@@ -53,8 +54,8 @@ def entry_point(
             try:
                 check(cfg)
                 task(cfg)
-            except (UserInputError, TrainingError) as error:
-                fail(error)
+            except Exception as error:
+                _fail_or_raise(error)
 
         def main() -> None:
             keep_pages()
@@ -65,21 +66,29 @@ def entry_point(
                     return
                 precheck(config_name, sys.argv[1:], check, check_folder)
                 hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
-            except (UserInputError, TrainingError) as error:
-                fail(error)
             except KeyboardInterrupt:
                 print("rcdsac_trl: interrupted", file=sys.stderr)
                 raise SystemExit(INTERRUPTED) from None
+            except Exception as error:
+                _fail_or_raise(error)
 
         return main
 
     return decorate
 
 
-def fail(error: UserInputError | TrainingError) -> NoReturn:
+def fail(error: UserInputError | FaultError) -> NoReturn:
     """Print the sentence and leave with code 2 for wrong input, else with 1."""
     print(f"rcdsac_trl: {error}", file=sys.stderr)
     raise SystemExit(2 if isinstance(error, UserInputError) else 1)
+
+
+def _fail_or_raise(error: Exception) -> NoReturn:
+    if isinstance(error, UserInputError | FaultError):
+        fail(error)
+    if (told := fault_sentence(error)) is not None:
+        fail(FaultError(told))
+    raise error
 
 
 def read_arguments(argv: list[str]) -> Namespace | None:

@@ -4,6 +4,7 @@ What is written under a temporary name, brought to the disk and then renamed can
 reader finds the old state or the new one. Names that begin with a dot are temporary, and nobody reads them.
 """
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -49,6 +50,27 @@ def write(path: Path, content: bytes) -> None:
     sync(temporary)
     os.rename(temporary, path)
     sync(path.parent)
+
+
+def reserve(folder: Path, size_bytes: int) -> None:
+    """Fail now as writing so much into a folder would fail.
+
+    A file that is written through memory does not fail where the disk is full: the process dies of SIGBUS.
+
+    Raises:
+        OSError: if there is no room.
+    """
+    if not hasattr(os, "posix_fallocate"):
+        return
+    path = folder / f"{_TEMPORARY}space"
+    try:
+        with path.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size_bytes)
+    except OSError as error:
+        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # else the file system cannot tell
+            raise OSError(error.errno, error.strerror, str(folder)) from error
+    finally:
+        path.unlink(missing_ok=True)
 
 
 def unfinished(path: Path) -> Path:

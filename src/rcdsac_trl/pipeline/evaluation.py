@@ -18,6 +18,8 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.metrics import METRICS, Condition, episode_metrics, summarise
+from rcdsac_trl.pipeline.resources import check_writable
+from rcdsac_trl.world.workers import WorkerError
 
 # What an episode's row needs; everything else of a step is dropped at once.
 _KEPT = [("next", key) for key in ("contact", "goal_reached", "reward_components", "velocity")]
@@ -100,7 +102,7 @@ class Validation:
     """Measures a policy on the same maps at every call, for as long as it trains.
 
     Args:
-        env: as for :func:`measure_map`; made for this alone, and closed by :meth:`close`.
+        make_env: makes what :func:`measure_map` drives in, now and after every fault; closed by :meth:`close`.
         policy: acts; its weights may change between calls.
         conditions: what the agents of each block are told.
         num_agents: episodes a map and a condition.
@@ -111,7 +113,7 @@ class Validation:
 
     def __init__(
         self,
-        env: EnvBase,
+        make_env: Callable[[], EnvBase],
         policy: TensorDictModuleBase,
         *,
         conditions: Sequence[Condition],
@@ -120,7 +122,8 @@ class Validation:
         steps: int,
         seed: int,
     ) -> None:
-        self.env = env
+        self._make_env = make_env
+        self._env: EnvBase | None = make_env()
         self.policy = policy
         self.conditions = conditions
         self.num_agents = num_agents
@@ -129,11 +132,24 @@ class Validation:
         self.seed = seed
 
     def __call__(self) -> pd.DataFrame:
-        """Return one row an episode, see :func:`measure_map`."""
-        self.env.set_seed(self.seed)
+        """Return one row an episode, see :func:`measure_map`.
+
+        Raises:
+            WorkerError: if a worker process died or hung; the next call begins in a new environment.
+        """
+        try:
+            if self._env is None:
+                self._env = self._make_env()
+            return self._measure(self._env)
+        except WorkerError:
+            self.close()
+            raise
+
+    def _measure(self, env: EnvBase) -> pd.DataFrame:
+        env.set_seed(self.seed)
         return table_of(
             measure_map(
-                self.env,
+                env,
                 self.policy,
                 conditions=self.conditions,
                 num_agents=self.num_agents,
@@ -145,8 +161,10 @@ class Validation:
 
     def close(self) -> None:
         """Close the environment, and bear that its workers may be gone."""
-        with contextlib.suppress(RuntimeError):
-            self.env.close(raise_if_closed=False)
+        if self._env is not None:
+            with contextlib.suppress(RuntimeError, OSError):
+                self._env.close(raise_if_closed=False)
+        self._env = None
 
 
 def _without_commit(described: str) -> dict[str, Any]:
@@ -183,6 +201,7 @@ class EvaluationRun:
         self.maps = maps
         if out.exists() and not out.is_dir():
             raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
+        check_writable(out)
         path = out / "evaluation.json"
         if path.exists() and _without_commit(path.read_text()) != _without_commit(self.described):
             raise UserInputError(f"{out} holds an evaluation of something else: give another folder with out=<folder>")

@@ -1,5 +1,6 @@
 """The run folder and everything written into it while training."""
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -21,6 +22,7 @@ from tqdm import tqdm
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.metrics import METRICS, Condition
+from rcdsac_trl.pipeline.resources import check_writable
 
 CONFIG_NAME = "config.yaml"
 _EXTRAS = {"wandb": "wandb", "mlflow": "mlflow"}
@@ -58,7 +60,8 @@ def commit() -> str:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that already holds a run."""
+    """Refuse a folder that already holds a run, or that nothing can be written into."""
+    check_writable(folder)
     if (folder / CONFIG_NAME).exists():
         raise UserInputError(f"{folder} already holds a run: choose another hydra.run.dir")
 
@@ -182,5 +185,6 @@ class RunLog:
             self.message(f"     validation {Condition(beta, weight)!s:>10}  {values}")
 
     def close(self) -> None:
-        """Close what is open."""
-        self._file.close()
+        """Close what is open, on a full disk too."""
+        with contextlib.suppress(OSError):
+            self._file.close()

@@ -120,6 +120,12 @@ def bytes_per_slot(num_bins_kept: int, context_keys: tuple[str, ...]) -> int:
     return sum(n * dtype.itemsize for n, dtype in slot_spec(num_bins_kept, context_keys).values())
 
 
+def replay_bytes(capacity_steps: int, episode_steps: int, num_bins_kept: int, context_keys: tuple[str, ...]) -> int:
+    """Return how many bytes a full replay takes, in memory and on the disk."""
+    slots = capacity_steps // episode_steps * (episode_steps + 1)
+    return slots * bytes_per_slot(num_bins_kept, context_keys)
+
+
 class SequenceReplay:
     """Replay of whole episodes that returns batches of sequences.
 

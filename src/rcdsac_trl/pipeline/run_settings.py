@@ -43,6 +43,12 @@ class TeamSettings:
 
     num_agents: int
     num_workers: Workers
+    worker_timeout_s: float | None
+    max_restarts: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is below 0."""
+        _check_least("world.max_restarts", self.max_restarts, 0)
 
 
 @dataclass(frozen=True)
@@ -131,6 +137,7 @@ class TrainingSettings:
             sensor=self.sensor.name,
             num_agents=self.world.num_agents,
             num_workers=self.world.num_workers,
+            worker_timeout_s=self.world.worker_timeout_s,
         )
 
     @property

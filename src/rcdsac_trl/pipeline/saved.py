@@ -39,6 +39,8 @@ class Progress:
         elapsed_s: time spent training, s.
         best_score: highest validation score so far; None before the first validation.
         best_iterations: iterations done when it was reached.
+        restarts: how often worker processes died or hung.
+        skipped_maps: training maps that were given up for that; iteration i is on map i + skipped_maps.
     """
 
     iterations: int = 0
@@ -47,6 +49,8 @@ class Progress:
     elapsed_s: float = 0.0
     best_score: float | None = None
     best_iterations: int | None = None
+    restarts: int = 0
+    skipped_maps: int = 0
 
 
 @dataclass(frozen=True)

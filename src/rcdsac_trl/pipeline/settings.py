@@ -188,6 +188,7 @@ class WorldSettings:
     sensor: str
     num_agents: int
     num_workers: int | Literal["auto"]
+    worker_timeout_s: float | None = None
     gui: bool = False
 
     def __post_init__(self) -> None:
@@ -197,6 +198,8 @@ class WorldSettings:
         if self.num_agents < 1:
             raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
         resolve_num_workers(self.num_workers, self.num_agents)
+        if self.worker_timeout_s is not None:
+            _positive("world", self, "worker_timeout_s")
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """The training loop: a new map and its episodes, then updates; look at the agent, save it, say how it goes."""
 
+import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import pandas as pd
@@ -10,13 +11,13 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
-from torchrl.collectors import Collector
 from torchrl.objectives import LossModule, SoftUpdate
 from tqdm import tqdm
 
 from rcdsac_trl.agent.transforms import Relabel
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
+from rcdsac_trl.pipeline.collection import Episodes
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.guard import FiniteGuard
@@ -24,8 +25,10 @@ from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics, validation_score
 from rcdsac_trl.pipeline.replay import SequenceReplay
+from rcdsac_trl.pipeline.resources import fault_sentence
 from rcdsac_trl.pipeline.saved import Progress
 from rcdsac_trl.pipeline.settings import Schedule
+from rcdsac_trl.world.workers import WorkerError
 
 LOSS_KEYS = ("loss_qvalue", "loss_actor", "loss_alpha")
 
@@ -108,16 +111,16 @@ class Trainer:
     Args:
         schedule: the layout of the run.
         progress: what is done already.
-        collector: yields the episodes of one iteration, ``[..., T]``, from the next iteration on.
-        set_iteration: told the iteration whose episodes are about to be collected.
+        episodes: collects the episodes of one iteration after another; closed at the end.
         learner: does the updates.
         guard: looks for NaN and infinity.
-        validate: returns one row an episode on validation maps; closed at the end, as the collector is.
+        validate: returns one row an episode on validation maps; closed at the end.
         validate_every: iterations between validations.
         checkpoints: where everything is saved.
         checkpoint_every: iterations between checkpoints.
         log: where everything is written.
         lock: keeps others out of the folder; let go at the end.
+        max_restarts: how often in a run worker processes may die or hang before it ends.
         context_key: what tells episodes apart in the log: ``"risk"``, ``"collision_weight"`` or None.
     """
 
@@ -126,8 +129,7 @@ class Trainer:
         *,
         schedule: Schedule,
         progress: Progress,
-        collector: Collector,
-        set_iteration: Callable[[int], None],
+        episodes: Episodes,
         learner: Learner,
         guard: FiniteGuard,
         validate: Validation,
@@ -136,12 +138,12 @@ class Trainer:
         checkpoint_every: int,
         log: RunLog,
         lock: FolderLock,
+        max_restarts: int,
         context_key: str | None,
     ) -> None:
         self.schedule = schedule
         self.progress = progress
-        self.collector = collector
-        self.set_iteration = set_iteration
+        self.episodes = episodes
         self.learner = learner
         self.guard = guard
         self.validate = validate
@@ -150,28 +152,32 @@ class Trainer:
         self.checkpoint_every = checkpoint_every
         self.log = log
         self.lock = lock
+        self.max_restarts = max_restarts
         self.context_key = context_key
 
     def run(self) -> None:
         """Train to the end of the schedule; what is done after the last checkpoint is lost if it ends early.
 
         Raises:
-            TrainingError: if a number is NaN or infinite.
+            TrainingError: if a number is NaN or infinite, workers fail too often, or the disk or the memory fails.
         """
         try:
             self._run()
         except KeyboardInterrupt:
-            self.log.message(
-                f"interrupted in iteration {self.progress.iterations}; "
-                f"{self.checkpoints.saved_iterations or 0} are saved, resume={self.log.folder} continues there"
-            )
+            self.log.message(f"interrupted in iteration {self.progress.iterations}; {self._saved_sentence()}")
             raise
         except TrainingError as error:
             self.log.message(str(error))
             raise
+        except Exception as error:
+            if (told := fault_sentence(error)) is None:
+                raise
+            told = f"{told}: training stops in iteration {self.progress.iterations}; {self._saved_sentence()}"
+            with contextlib.suppress(OSError):  # the log may be on the same disk
+                self.log.message(told)
+            raise TrainingError(told) from error
         finally:
-            # A shell's Ctrl-C may have ended the workers already: closing must not hide why training ends.
-            self.collector.shutdown(raise_on_error=False)
+            self.episodes.close()
             self.validate.close()
             self.log.close()
             self.lock.close()
@@ -182,10 +188,9 @@ class Trainer:
         if self.checkpoints.saved_iterations is None:
             self._save()  # so that whatever is in the folder later can be told from what was never saved
         started = time.monotonic() - self.progress.elapsed_s
-        episodes = self._episodes()
         with tqdm(total=total, initial=self.progress.iterations, unit="it", disable=None, smoothing=0.1) as bar:
             for iteration in range(self.progress.iterations, total):
-                record = self._iterate(iteration, episodes)
+                record = self._iterate(iteration)
                 record["time/elapsed_s"] = time.monotonic() - started
                 self.progress = replace(self.progress, iterations=iteration + 1, elapsed_s=record["time/elapsed_s"])
                 self.log.scalars(record, self.progress.steps)
@@ -193,17 +198,12 @@ class Trainer:
                 if self._is_due(iteration, self.checkpoint_every) or self.progress.best_iterations == iteration + 1:
                     self._save()
 
-    def _episodes(self) -> Iterator[TensorDictBase]:
-        for batch in self.collector:
-            yield batch.reshape(-1, batch.shape[-1])
-
-    def _iterate(self, iteration: int, episodes: Iterator[TensorDictBase]) -> dict[str, float]:
-        self.set_iteration(iteration)
+    def _iterate(self, iteration: int) -> dict[str, float]:
         self.guard.start_iteration(iteration)
         strength = self.schedule.distortion_strength(iteration)
         share = self.schedule.learning_rate_share(iteration)
         t0 = time.monotonic()
-        batch = next(episodes)
+        batch = self._collect(iteration)
         t1 = time.monotonic()
         self.guard.check_episodes(batch)
         self.learner.replay.add_episodes(batch)
@@ -228,6 +228,33 @@ class Trainer:
             record |= self._validate(iteration)
         return record
 
+    def _collect(self, iteration: int) -> TensorDictBase:
+        """Drive an iteration's episodes; on the next map, if workers fail on its own, as often as may be."""
+        while True:
+            map_index = iteration + self.progress.skipped_maps
+            try:
+                return self.episodes.collect(iteration, map_index)
+            except WorkerError as error:
+                self._restart(f"iteration {iteration}, training map {map_index}", error)
+                self.progress = replace(self.progress, skipped_maps=self.progress.skipped_maps + 1)
+                self.log.message(
+                    f"the episodes on map {map_index} are dropped: iteration {iteration} drives on the next"
+                )
+
+    def _restart(self, where: str, error: WorkerError) -> None:
+        """Count a fault of the workers and tell it, or stop if there were too many."""
+        if self.progress.restarts == self.max_restarts:
+            raise TrainingError(
+                f"{where}: {error}; world.max_restarts={self.max_restarts} allows no further restart: training stops; "
+                f"{self._saved_sentence()}"
+            ) from error
+        self.progress = replace(self.progress, restarts=self.progress.restarts + 1)
+        self.log.message(f"{where}: {error}; restart {self.progress.restarts} of at most {self.max_restarts}")
+
+    def _saved_sentence(self) -> str:
+        saved = self.checkpoints.saved_iterations or 0
+        return f"{saved} iterations are saved, resume={self.log.folder} continues there"
+
     def _is_due(self, iteration: int, every: int) -> bool:
         """Say whether what is done every so many iterations, and after the last one, is done after this one."""
         return iteration + 1 == self.schedule.iterations or (iteration + 1) % every == 0
@@ -251,8 +278,16 @@ class Trainer:
         self.log.episodes("training", rows)
         return record
 
+    def _validation_rows(self, iteration: int) -> pd.DataFrame:
+        """Validate, from the beginning if workers fail: its maps stay the same."""
+        while True:
+            try:
+                return self.validate()
+            except WorkerError as error:
+                self._restart(f"iteration {iteration}, validation", error)
+
     def _validate(self, iteration: int) -> dict[str, float]:
-        rows = self.validate()
+        rows = self._validation_rows(iteration)
         rows.insert(0, "iteration", iteration)
         rows.insert(1, "updates", self.progress.updates)
         self.log.episodes("validation", rows)

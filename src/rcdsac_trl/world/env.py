@@ -2,15 +2,15 @@
 
 import multiprocessing
 import os
-import signal
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
+from torchrl.envs import EnvBase, SerialEnv
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.agents import AgentGroup
@@ -18,11 +18,9 @@ from rcdsac_trl.world.maps import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES, Space
 from rcdsac_trl.world.task import TaskSettings
+from rcdsac_trl.world.workers import START_METHOD, Workers, worker_env
 
 COLLISION_WEIGHT = "collision_weight"
-# A worker made by "fork" inherits the learner's threads and locks in whatever state they are, one made by "spawn"
-# imports everything anew, which takes seconds. A fork server is a clean process that has imported it all once.
-_START_METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 
 
 class NavigationEnv(EnvBase):
@@ -170,33 +168,6 @@ class NavigationEnv(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
 
-class _Workers(ParallelEnv):
-    """A ``ParallelEnv`` that leaves this process's number of threads alone.
-
-    The original takes a thread a worker from this process as long as the workers live, and when it closes sets the
-    number that the process had when TorchRL was imported. Here workers rest while the learner computes.
-    """
-
-    def _start_workers(self) -> None:
-        self.num_threads = torch.get_num_threads()
-        super()._start_workers()
-
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        threads = torch.get_num_threads()
-        super().close(raise_if_closed=raise_if_closed)
-        torch.set_num_threads(threads)
-
-
-def _worker_env(**kwargs: Any) -> NavigationEnv:
-    """Make the environment of a worker, which leaves Ctrl-C to the process that it works for.
-
-    A terminal sends Ctrl-C to all of them; workers that died of it could not be closed properly any more.
-    """
-    if multiprocessing.parent_process() is not None:  # the main process makes one too, to learn its specs
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return NavigationEnv(**kwargs)
-
-
 def _torch_spec(space: Space, batch: torch.Size) -> TensorSpec:
     shape = torch.Size([*batch, space.size])
     if space.dtype is np.bool_:
@@ -231,6 +202,7 @@ def make_env(
     num_workers: int | Literal["auto"] = "auto",
     first_episode: int = 0,
     weighted_collisions: bool = False,
+    worker_timeout_s: float | None = None,
     serial: bool = False,
     gui: bool = False,
 ) -> EnvBase:
@@ -248,11 +220,15 @@ def make_env(
             that is not above the number of cores this process may use.
         first_episode: number of the first episode.
         weighted_collisions: whether the environment reads ``collision_weight``.
+        worker_timeout_s: seconds without an answer after which a worker process counts as hung; None: it never does.
         serial: put the W environments into a ``SerialEnv`` in this process instead (for tests and debugging).
         gui: show PyBullet's window for the first agent.
 
     Raises:
         UserInputError: the workers cannot share the agents evenly, or as :class:`NavigationEnv`.
+
+    What it returns raises :class:`~rcdsac_trl.world.workers.WorkerError` when a worker process dies or hangs; it can
+    then only be closed.
 
     Example:
         >>> make_env(num_workers=0).batch_size
@@ -278,4 +254,10 @@ def make_env(
     if serial:
         return SerialEnv(workers, NavigationEnv, create_env_kwargs=kwargs)
     multiprocessing.set_forkserver_preload([__name__])
-    return _Workers(workers, _worker_env, create_env_kwargs=kwargs, mp_start_method=_START_METHOD)
+    return Workers(
+        workers,
+        partial(worker_env, NavigationEnv),
+        create_env_kwargs=kwargs,
+        mp_start_method=START_METHOD,
+        timeout_s=worker_timeout_s,
+    )

@@ -1,6 +1,5 @@
 """A training run from its config."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +9,12 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.agent.targets import FusedSoftUpdate
-from rcdsac_trl.pipeline import logs, runtime
+from rcdsac_trl.pipeline import logs, resources, runtime
 from rcdsac_trl.pipeline.build.agent import (
     make_average,
     make_loss,
@@ -26,11 +26,12 @@ from rcdsac_trl.pipeline.build.agent import (
 from rcdsac_trl.pipeline.build.read import settings_of_run, training_settings
 from rcdsac_trl.pipeline.build.world import environment, evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators
+from rcdsac_trl.pipeline.collection import Episodes
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.guard import FiniteGuard, load_failure
 from rcdsac_trl.pipeline.policies import CollectionPolicy
-from rcdsac_trl.pipeline.replay import SequenceReplay
+from rcdsac_trl.pipeline.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, Saved, best_damage, newest
@@ -52,6 +53,19 @@ def check_training(cfg: DictConfig) -> None:
     settings = training_settings(cfg)
     runtime.resolve_device(settings.device)
     logs.check_backends(settings.logger.backends)
+    _check_memory(settings)
+
+
+def _check_memory(settings: TrainingSettings) -> None:
+    remedy = "lower replay.capacity_steps, or end other programs"
+    resources.check_memory("the replay", _replay_bytes(settings), remedy)
+
+
+def _replay_bytes(settings: TrainingSettings) -> int:
+    algo = settings.algo
+    keys = (algo.context_key,) if algo.context_key is not None else ()
+    bins = int(sensor_mask(settings.sensor.name).sum())
+    return replay_bytes(settings.replay_steps, settings.task.episode_steps, bins, keys)
 
 
 def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
@@ -106,6 +120,8 @@ def resumed(folder: Path) -> Trainer | None:
         UserInputError: if another process trains in it, or it has checkpoints and none is whole.
     """
     settings = settings_of_run(folder, key="resume")
+    resources.check_writable(folder)
+    _check_memory(settings)
     lock = FolderLock(folder)
     try:
         saved, damaged = newest(folder / CHECKPOINTS, replay=folder / REPLAY) if has_begun(folder) else (None, [])
@@ -150,6 +166,11 @@ def _assemble(
         replay=ReplayFiles(folder / REPLAY, learner.replay),
         keep=settings.checkpoint.keep,
     )
+    written = sum(path.stat().st_size for path in (folder / REPLAY).glob("*"))
+    # Those that stay, the best, the one being written; a checkpoint doubles when the optimiser has its state.
+    checkpoints_bytes = 2 * checkpoints.size_bytes() * (settings.checkpoint.keep + 2)
+    shortage = resources.disk_shortage(folder, max(0, _replay_bytes(settings) - written) + checkpoints_bytes)
+    told = [*told, *([] if shortage is None else [shortage])]
     progress = Progress()
     if saved is not None:
         progress, more = _restore(folder, checkpoints, saved)
@@ -158,12 +179,10 @@ def _assemble(
     log = logs.RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
     for sentence in [*told, f"device {device}, {threads} threads, allocator: {runtime.allocator()}"]:
         log.message(sentence)
-    collector, set_iteration = _collection(settings, loss, device, progress.iterations)
     return Trainer(
         schedule=settings.schedule,
         progress=progress,
-        collector=collector,
-        set_iteration=set_iteration,
+        episodes=_episodes(settings, loss, device, progress),
         learner=learner,
         guard=FiniteGuard(folder, loss, optimizer),
         validate=_validation(settings, average.module, device),
@@ -172,6 +191,7 @@ def _assemble(
         checkpoint_every=settings.checkpoint.every_iterations,
         log=log,
         lock=lock,
+        max_restarts=settings.world.max_restarts,
         context_key=settings.algo.context_key,
     )
 
@@ -186,20 +206,9 @@ def _restore(folder: Path, checkpoints: Checkpoints, saved: Saved) -> tuple[Prog
     return replace(saved.progress, best_score=None, best_iterations=None), [*told, damage]
 
 
-def _collection(
-    settings: TrainingSettings, loss: LossModule, device: str, first_iteration: int
-) -> tuple[Collector, Callable[[int], None]]:
-    """Make what yields the episodes of each iteration, and what must be told an iteration before them."""
+def _episodes(settings: TrainingSettings, loss: LossModule, device: str, progress: Progress) -> Episodes:
+    """Make what collects the episodes of each iteration."""
     schedule, world = settings.schedule, settings.training_world
-    env = environment(
-        world,
-        settings.algo,
-        split="train",
-        seed=settings.seed,
-        agent_ids=range(world.num_agents),
-        memory=settings.network.memory,
-        first_episode=first_iteration,  # iteration i is episode i of every agent, on map i
-    )
     exploration = torch.Generator(device=device)
     policy = CollectionPolicy(
         make_policy(loss.actor_network, exploration, device),
@@ -209,26 +218,42 @@ def _collection(
         pursuit_noise=schedule.pursuit_noise,
     )
     iteration_steps = world.num_agents * world.task.episode_steps
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=iteration_steps,
-        total_frames=(schedule.iterations - first_iteration) * iteration_steps,
-        exploration_type=ExplorationType.RANDOM,
-        trust_policy=True,
-        use_buffers=False,
-    )
-    return collector, policy.set_iteration
+
+    def collector(iteration: int, map_index: int) -> Collector:
+        env = environment(
+            world,
+            settings.algo,
+            split="train",
+            seed=settings.seed,
+            agent_ids=range(world.num_agents),
+            memory=settings.network.memory,
+            first_episode=map_index,  # episode k of every agent is on map k
+        )
+        return Collector(
+            env,
+            policy,
+            frames_per_batch=iteration_steps,
+            total_frames=(schedule.iterations - iteration) * iteration_steps,
+            exploration_type=ExplorationType.RANDOM,
+            trust_policy=True,
+            use_buffers=False,
+        )
+
+    done = progress.iterations
+    return Episodes(collector, policy.set_iteration, iteration=done, map_index=done + progress.skipped_maps)
 
 
 def _validation(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> Validation:
     algo, world = settings.algo, settings.training_world
     conditions = algo.default_conditions
-    env = evaluation_environment(
-        world, algo, conditions, "validation", VALIDATION_SEED, world.num_agents, settings.network.memory
-    )
+
+    def make_env() -> EnvBase:
+        return evaluation_environment(
+            world, algo, conditions, "validation", VALIDATION_SEED, world.num_agents, settings.network.memory
+        )
+
     return Validation(
-        env,
+        make_env,
         make_policy(actor, torch.Generator(device=device), device),
         conditions=conditions,
         num_agents=world.num_agents,

@@ -46,6 +46,7 @@ def environment(
         num_workers=world.num_workers,
         first_episode=first_episode,
         weighted_collisions=weighted,
+        worker_timeout_s=world.worker_timeout_s,
         gui=world.gui,
     )
     env = TransformedEnv(base)

@@ -1,0 +1,97 @@
+"""Disk and memory: what can be known before work starts, and the sentence for what shows only then.
+
+Nothing here imports torch: entry points read it before they know that their input is right.
+"""
+
+import errno
+import os
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+from rcdsac_trl.errors import UserInputError
+
+_MEMINFO = Path("/proc/meminfo")
+_CGROUP = Path("/sys/fs/cgroup")
+_DISK = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "a file became larger than this system or its limits allow",
+    errno.EROFS: "the disk is read-only",
+    errno.EACCES: "writing is not allowed",
+    errno.EPERM: "writing is not allowed",
+    errno.EIO: "the disk fails",
+}
+_NO_MEMORY = ("can't allocate memory", "cannot allocate memory", "out of memory")
+
+
+def fault_sentence(error: BaseException) -> str | None:
+    """Say in words that the disk or the memory failed; None for an error of another kind.
+
+    Example:
+        >>> fault_sentence(OSError(errno.ENOSPC, "No space left on device", "runs/a/replay"))
+        'the disk is full (runs/a/replay: No space left on device)'
+    """
+    if isinstance(error, OSError) and error.errno in _DISK:
+        what = f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror)
+        return f"{_DISK[error.errno]} ({what})"
+    text = str(error).lower()
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(t in text for t in _NO_MEMORY)):
+        told = " ".join(str(error).split())
+        return "there is not enough memory" + (f" ({told})" if told else "")
+    return None
+
+
+def check_writable(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written into.
+
+    Raises:
+        UserInputError: naming the nearest folder that exists, and is not one or takes nothing new.
+    """
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise UserInputError(f"{folder} cannot be a folder: {existing} is a file, choose another")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise UserInputError(f"nothing can be written into {existing}: choose a folder elsewhere than {folder}")
+
+
+def available_memory_bytes() -> int | None:
+    """Return how much memory and swap this process can still take; None where the system does not say (not Linux)."""
+    found = []
+    with suppress(OSError, KeyError, ValueError):
+        lines = dict(line.split(":", 1) for line in _MEMINFO.read_text().splitlines())
+        found.append(sum(int(lines[key].split()[0]) for key in ("MemAvailable", "SwapFree")) * 1024)
+    with suppress(OSError, KeyError, ValueError):  # "max" where there is no limit
+        used = int((_CGROUP / "memory.current").read_text())
+        # Files that were read count as used, but give way.
+        stat = dict(line.split() for line in (_CGROUP / "memory.stat").read_text().splitlines())
+        found.append(int((_CGROUP / "memory.max").read_text()) - used + int(stat["inactive_file"]))
+    return min(found, default=None)
+
+
+def check_memory(what: str, needed_bytes: int, remedy: str) -> None:
+    """Refuse what does not fit into the memory that is available now.
+
+    Raises:
+        UserInputError: with both numbers.
+    """
+    available = available_memory_bytes()
+    if available is not None and needed_bytes > available:
+        raise UserInputError(
+            f"{what} needs {_size(needed_bytes)} of memory, {_size(available)} are available: {remedy}"
+        )
+
+
+def disk_shortage(folder: Path, needed_bytes: int) -> str | None:
+    """Say that a folder's disk has too little space for what will be written; None if it has enough."""
+    free = shutil.disk_usage(folder).free
+    if needed_bytes <= free:
+        return None
+    return (
+        f"WARNING: the run needs up to {_size(needed_bytes)} in {folder}, whose disk has {_size(free)} free: make "
+        "room, else it ends when the disk is full"
+    )
+
+
+def _size(number: int) -> str:
+    return f"{number / 1e9:.1f} GB" if number >= 1e8 else f"{number / 1e6:.1f} MB"
