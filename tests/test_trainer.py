@@ -578,7 +578,7 @@ def test_an_iteration_whose_workers_fail_is_driven_on_the_next_map(tmp_path: Pat
         (0, 0, 0, 0), (1, 8, 0, 0), (2, 16, 1, 1), (3, 24, 1, 1), (4, 32, 3, 3), (5, 40, 3, 3),
     ]  # fmt: skip
     told = (tmp_path / "train.log").read_text().splitlines()
-    assert told[2:4] == [
+    assert told[4:6] == [
         "iteration 1, training map 1: worker process 1 of 1 was killed by SIGKILL; restart 1 of at most 3",
         "the episodes on map 1 are dropped: iteration 1 drives on the next",
     ]

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -170,8 +171,15 @@ class Validation:
 def _without_commit(described: str) -> dict[str, Any]:
     """Return what was evaluated; the same by a later commit may take its place."""
     values: dict[str, Any] = json.loads(described)
-    values.pop("commit", None)
-    return values
+    return {key: value for key, value in values.items() if key != "commit"}
+
+
+def _holds_another(path: Path, described: str) -> bool:
+    """Say whether a file describes another evaluation; one that cannot be read does."""
+    try:
+        return _without_commit(path.read_text()) != _without_commit(described)
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return True
 
 
 class EvaluationRun:
@@ -199,11 +207,11 @@ class EvaluationRun:
         self.described = json.dumps(described, indent=2) + "\n"
         self.num_maps = num_maps
         self.maps = maps
-        if out.exists() and not out.is_dir():
+        if os.path.exists(out) and not out.is_dir():
             raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
         check_writable(out)
         path = out / "evaluation.json"
-        if path.exists() and _without_commit(path.read_text()) != _without_commit(self.described):
+        if path.exists() and _holds_another(path, self.described):
             raise UserInputError(f"{out} holds an evaluation of something else: give another folder with out=<folder>")
 
     def run(self) -> None:

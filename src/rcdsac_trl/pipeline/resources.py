@@ -48,6 +48,10 @@ def check_writable(folder: Path) -> None:
     Raises:
         UserInputError: naming the nearest folder that exists, and is not one or takes nothing new.
     """
+    try:
+        folder.exists()
+    except OSError as error:  # such as a name that is too long
+        raise UserInputError(f"{folder} cannot be a folder ({error.strerror}): choose another") from error
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise UserInputError(f"{folder} cannot be a folder: {existing} is a file, choose another")

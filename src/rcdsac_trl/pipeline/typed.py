@@ -1,7 +1,7 @@
 """Plain values, as YAML and a command line bring them, into settings: every key known, every type right."""
 
 import difflib
-import math
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from types import NoneType, UnionType
@@ -12,6 +12,8 @@ from rcdsac_trl.errors import UserInputError
 Settings = TypeVar("Settings")
 
 _NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
+# Whole numbers from here on fit no tensor and no index.
+_LARGEST = 2**63
 _PLURALS = {int: "whole numbers", float: "numbers", bool: "true or false", str: "words"}
 
 
@@ -88,8 +90,12 @@ def _is_a(value: Any, hint: Any) -> bool:
     if isinstance(value, bool):  # Python counts it as a number
         return hint is bool
     if hint is float:
-        return isinstance(value, int | float) and math.isfinite(value)
-    return isinstance(value, hint)
+        # Python compares whole numbers of any size, but turns only those below this into a float.
+        return isinstance(value, int | float) and abs(value) <= sys.float_info.max
+    if hint is int:
+        return isinstance(value, int) and abs(value) < _LARGEST
+    # No file system and no library takes a text with this character.
+    return isinstance(value, hint) and not (hint is str and "\0" in value)
 
 
 def _describe(hint: Any) -> str:

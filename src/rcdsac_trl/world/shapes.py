@@ -26,6 +26,10 @@ FORMAT_VERSION = 1
 """Version of the JSON that :meth:`Map.to_json` writes."""
 
 
+# Larger ones the planner's grid could not hold.
+_MAX_SIZE_M = 200.0
+
+
 @dataclass(frozen=True)
 class Box:
     """An upright box, seen from above.
@@ -160,6 +164,37 @@ class Map:
                 raise ValueError(f"its format is {version!r}, only {FORMAT_VERSION} can be read")
             for key, part in (("boxes", Box), ("cylinders", Cylinder), ("movers", Mover)):
                 data[key] = tuple(part(**item) for item in data[key])
-            return cls(**data)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            map_ = cls(**data)
+            _check_read(map_)
+            return map_
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise UserInputError(f"the text is not a map ({error}); give what Map.to_json wrote") from error
+
+
+def _check_read(map_: Map) -> None:
+    """Refuse values that no map has, with a ValueError."""
+    if not isinstance(map_.layout, str):
+        raise ValueError(f"layout is {map_.layout!r}, not text")
+    _check_number("size_m", map_.size_m, 1.0, _MAX_SIZE_M)
+    for name in ("clearance_margin_m", "waypoint_clearance_m"):
+        _check_number(name, getattr(map_, name), 0.0, map_.size_m)
+    parts: list[tuple[str, Box | Cylinder | Mover]] = [
+        *(("boxes", box) for box in map_.boxes),
+        *(("cylinders", cylinder) for cylinder in map_.cylinders),
+        *(("movers", mover) for mover in map_.movers),
+    ]
+    for where, part in parts:
+        for name, value in vars(part).items():
+            if name in ("mapped", "wall"):
+                if not isinstance(value, bool):
+                    raise ValueError(f"{name} in {where} is {value!r}, neither true nor false")
+            elif name == "yaw":
+                _check_number(f"yaw in {where}", value, -2 * math.pi, 2 * math.pi)
+            else:
+                _check_number(f"{name} in {where}", value, 0.0, map_.size_m)
+
+
+def _check_number(name: str, value: object, low: float, high: float) -> None:
+    # The comparison is false for NaN too.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ValueError(f"{name} is {value!r}, not a number from {low:g} to {high:g}")

@@ -1,5 +1,6 @@
 """The config as checked settings: the only module that knows how a config is laid out."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +47,14 @@ def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
         UserInputError: if the folder holds no run, or one that this version cannot read.
     """
     path = folder / CONFIG_NAME
-    if not path.is_file():
+    if not os.path.isfile(path):  # false for a name that is too long, too
         raise UserInputError(f"{key}={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
     try:
         cfg = OmegaConf.load(path)
         if not isinstance(cfg, DictConfig):
             raise UserInputError("it holds no keys")
         return training_settings(cfg)
-    except (OSError, yaml.YAMLError, OmegaConfBaseException, UserInputError) as error:
+    except (OSError, ValueError, TypeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())
         raise UserInputError(f"{path} cannot be read ({reason}): name a folder that this version wrote") from error
 

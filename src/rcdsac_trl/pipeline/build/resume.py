@@ -90,7 +90,7 @@ def _own_overrides(folder: Path) -> list[str]:
     """Read what Hydra noted of the call that started a run; nothing if that is not there any more."""
     try:
         noted = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text())
-    except (OSError, yaml.YAMLError):
+    except (OSError, ValueError, yaml.YAMLError):
         return []
     return [override for override in noted or [] if _key(override) != "resume"]
 
@@ -108,9 +108,9 @@ def _config(folder: Path) -> dict[str, Any] | None:
     """Read a run's config; None if there is nothing to compare."""
     try:
         cfg = OmegaConf.load(folder / CONFIG_NAME)
-    except (OSError, yaml.YAMLError, OmegaConfBaseException):
+        return _comparable(cfg) if isinstance(cfg, DictConfig) else None
+    except (OSError, ValueError, TypeError, yaml.YAMLError, OmegaConfBaseException):
         return None
-    return _comparable(cfg) if isinstance(cfg, DictConfig) else None
 
 
 def _comparable(cfg: DictConfig) -> dict[str, Any]:
