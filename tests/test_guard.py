@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 from rcdsac_trl import train
 from rcdsac_trl.errors import TrainingError
@@ -81,14 +81,14 @@ def test_a_gradient_that_is_not_finite_ends_the_run_although_the_losses_are(tmp_
 )
 def test_an_episode_that_is_not_finite_is_never_stored(tmp_path: Path, key: str | tuple[str, str], name: str) -> None:
     trainer = tiny_trainer(tmp_path / "run")
-    episodes = trainer._episodes
+    collect = trainer.episodes.collect
 
-    def spoilt():  # type: ignore[no-untyped-def]
-        for batch in episodes():
-            batch[key][1, 7, 0] = -math.inf
-            yield batch
+    def spoilt(iteration: int, map_index: int) -> TensorDictBase:
+        batch = collect(iteration, map_index)
+        batch[key][1, 7, 0] = -math.inf
+        return batch
 
-    trainer._episodes = spoilt  # type: ignore[method-assign]
+    trainer.episodes.collect = spoilt  # type: ignore[method-assign]
     assert failing(trainer).startswith(f"{name} of episode 1 at step 7 is NaN or infinite in iteration 0: training st")
     assert len(trainer.learner.replay) == 0
     dump = load_failure(tmp_path / "run" / "failure" / "iteration-000000", make_loss(tiny_settings(), "cpu"))
