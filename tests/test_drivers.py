@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.pipeline.drivers import Drive, Rows, drive_maps, resolve_processes
 
 
@@ -32,7 +32,7 @@ def test_every_map_is_driven_once_and_by_a_process_of_its_own() -> None:
 
 
 def test_a_process_that_dies_ends_the_evaluation_and_leaves_none_behind() -> None:
-    with pytest.raises(RuntimeError, match="exit code 7"):
+    with pytest.raises(FaultError, match="exit code 7"):
         list(drive_maps(breaking, 4, processes=2))
     assert not multiprocessing.active_children()
 

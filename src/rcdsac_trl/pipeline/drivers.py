@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from multiprocessing.connection import Connection, wait
 from typing import Any, Literal, cast
 
-from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.errors import FaultError, UserInputError
 
 Rows = list[dict[str, Any]]
 Drive = Callable[[int], Rows]
@@ -55,7 +55,7 @@ def drive_maps(
         processes: from :func:`resolve_processes`.
 
     Raises:
-        RuntimeError: if a process ends before its work does; it has written why to stderr.
+        FaultError: if a process ends before its work does; it has written why to stderr.
     """
     if processes == 0:
         with make() as drive:
@@ -95,7 +95,9 @@ def _share_out(num_maps: int, workers: dict[Connection, Any]) -> Generator[Rows,
             except EOFError as error:
                 workers[connection].join()
                 code = workers[connection].exitcode
-                raise RuntimeError(f"a process of the evaluation ended too early (exit code {code})") from error
+                raise FaultError(
+                    f"a process of the evaluation ended too early (exit code {code}): nothing is written, start again"
+                ) from error
             yield rows
             following = next(waiting, None)
             if following is None:
