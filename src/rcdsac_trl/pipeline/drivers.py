@@ -10,13 +10,12 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Literal, cast
 
 from rcdsac_trl.errors import FaultError, UserInputError
+from rcdsac_trl.world.workers import START_METHOD
 
 Rows = list[dict[str, Any]]
 Drive = Callable[[int], Rows]
 """Drives all episodes of the map of a number, one row an episode."""
 
-# As for the environment's workers: a clean process that has imported everything once.
-_START_METHOD = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
 _PRELOADED = "rcdsac_trl.pipeline.build"
 
 
@@ -63,7 +62,7 @@ def drive_maps(
         return
     # What the processes import, imported once.
     multiprocessing.set_forkserver_preload([_PRELOADED])
-    context: Any = multiprocessing.get_context(_START_METHOD)
+    context: Any = multiprocessing.get_context(START_METHOD)
     workers: dict[Connection, Any] = {}
     try:
         for _ in range(processes):
