@@ -183,7 +183,13 @@ class ReferenceLoss(LossModule):
         with self.target_critic_network_params.to_module(self.critic_network):
             values = [self._value(critic, following, padded, tau)[:, 1:] for critic in self.critic_network]
         both = torch.stack(values)
-        value = both.amin(0) if self.settings.target_over_critics == "minimum" else both.mean(0)
+        if self.settings.target_over_critics == "minimum":
+            value = both.amin(0)
+        elif self.settings.target_over_critics == "mean":
+            value = both.mean(0)
+        else:
+            chosen = both.mean(-1, keepdim=True).argmin(0, keepdim=True)
+            value = both.take_along_dim(chosen, 0).squeeze(0)
         value = value - alpha * log_prob.unsqueeze(-1)
         alive = 1.0 - current["next", "terminated"].to(value.dtype)
         return current["next", "reward"] + self.settings.value_estimator.gamma * alive * value

@@ -5,7 +5,7 @@ Public names::
     quantile_huber_loss(quantiles [..,N], targets [..,N'], tau [..,N], kappa=1) -> [..]
     squash(loc, scale, noise) -> action, log_prob
     call_module(module, entries) -> what it writes, by its keys' order
-    minimum(values) -> element-wise minimum
+    minimum(values), mean(values) -> element-wise; smaller(values) -> of each entry, all of the critic with smaller mean
 """
 
 import math
@@ -99,4 +99,24 @@ def minimum(values: list[Tensor]) -> Tensor:
     smallest = values[0]
     for value in values[1:]:
         smallest = torch.minimum(smallest, value)
+    return smallest
+
+
+def mean(values: list[Tensor]) -> Tensor:
+    """Element-wise mean over the critics."""
+    return torch.stack(values).mean(0)
+
+
+def smaller(values: list[Tensor]) -> Tensor:
+    """Return ``[.., N]`` of ``[.., N]`` a critic: of each entry all fractions of the critic whose mean is smallest.
+
+    Example:
+        >>> smaller([torch.tensor([[0.0, 9.0]]), torch.tensor([[3.0, 4.0]])])
+        tensor([[3., 4.]])
+    """
+    smallest, its_mean = values[0], values[0].mean(-1, keepdim=True)
+    for value in values[1:]:
+        other_mean = value.mean(-1, keepdim=True)
+        smallest = torch.where(other_mean < its_mean, value, smallest)
+        its_mean = torch.minimum(other_mean, its_mean)
     return smallest

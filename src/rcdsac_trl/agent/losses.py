@@ -33,8 +33,11 @@ from torchrl.objectives.utils import (
     distance_loss,
 )
 
-from rcdsac_trl.agent.functional import call_module, minimum, quantile_huber_loss, squash
+from rcdsac_trl.agent.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
+
+#: What a target can take of the target critics.
+OVER_CRITICS: dict[str, Callable[[list[Tensor]], Tensor]] = {"minimum": minimum, "smaller": smaller, "mean": mean}
 
 
 class DistributionalSACLoss(LossModule):
@@ -46,8 +49,8 @@ class DistributionalSACLoss(LossModule):
     - critic: :func:`~rcdsac_trl.agent.functional.quantile_huber_loss` at fractions
       :math:`\tau_i, \tau'_j \sim U(0,1)` between :math:`\hat Z_{\tau_i}(s_t, a_t; \beta)` and
       :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a; \beta) - \alpha \log\pi(a|s_{t+1},\beta))`,
-      with a policy action :math:`a` and the element-wise minimum (or mean) over the target critics; summed over the
-      critics;
+      with a policy action :math:`a` and the element-wise minimum (or what ``target_over_critics`` says) over the target
+      critics; summed over the critics;
     - actor: :math:`\alpha \log\pi - \min_k \frac1K \sum_j \hat Z^k_{\psi(\tau_j;\beta)}(s_t, a; \beta)`;
     - temperature: :math:`-\log\alpha \, (\log\pi + \bar H)`.
 
@@ -76,9 +79,11 @@ class DistributionalSACLoss(LossModule):
         alpha_init: temperature at the start, above 0.
         target_entropy: the entropy the temperature aims for, in nats.
         burn_in: number of leading transitions of a sequence that only warm the memory up and carry no loss.
-        target_over_critics: what the target takes of the target critics at each fraction. The minimum of two quantile
-            functions that disagree lowers *both* tails, and bootstrapping adds that up; the mean has no such bias, but
-            the policy then finds what both overestimate.
+        target_over_critics: what the target takes of the target critics: at each fraction their ``"minimum"`` or
+            ``"mean"``, or all fractions of the one whose mean is the ``"smaller"``. The minimum of two quantile
+            functions that disagree lowers *both* tails, and bootstrapping adds that up; choosing a whole function
+            lowers the mean alone, as with scalar critics, where it is the minimum; the mean has no such bias, but the
+            policy then finds what both overestimate.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``; over batch and time. ``"none"`` leaves every entry of the
             output ``[B, L - burn_in]``.
         generator: source of all random numbers; None for one seeded with 0. Its state is part of ``state_dict``.
@@ -147,7 +152,7 @@ class DistributionalSACLoss(LossModule):
         alpha_init: float = 1.0,
         target_entropy: float = -2.0,
         burn_in: int = 0,
-        target_over_critics: Literal["minimum", "mean"] = "minimum",
+        target_over_critics: Literal["minimum", "smaller", "mean"] = "minimum",
         reduction: Literal["mean", "sum", "none"] = "mean",
         generator: torch.Generator | None = None,
     ) -> None:
@@ -165,8 +170,8 @@ class DistributionalSACLoss(LossModule):
             raise ValueError(f"fractions_per = {fractions_per!r} must be 'sequence' or 'transition'")
         if loss_function not in ("smooth_l1", "l2"):
             raise ValueError(f"loss_function = {loss_function!r} must be 'smooth_l1' or 'l2'")
-        if target_over_critics not in ("minimum", "mean"):
-            raise ValueError(f"target_over_critics = {target_over_critics!r} must be 'minimum' or 'mean'")
+        if target_over_critics not in OVER_CRITICS:
+            raise ValueError(f"target_over_critics = {target_over_critics!r} must be one of {', '.join(OVER_CRITICS)}")
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
         self._critics = tuple(critics)
@@ -325,7 +330,7 @@ class DistributionalSACLoss(LossModule):
             for critic in self._target_critics:
                 memory = self._encode(critic, tensordict)[:, 1:]
                 values.append(self._evaluate(critic, memory, action, tau, risk))
-            next_value = minimum(values) if self.target_over_critics == "minimum" else torch.stack(values).mean(0)
+            next_value = OVER_CRITICS[self.target_over_critics](values)
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
             # The estimator checks shapes strictly, so every target fraction gets its own entry.
             outcome = TensorDict(batch_size=batch.batch_size)

@@ -15,7 +15,7 @@ from rcdsac_trl.world.task import TaskSettings
 Critic = Literal["quantile", "scalar"]
 Conditioning = Literal["per_episode", "fixed", "none"]
 Relabel = Literal["resample", "stored"]
-OverCritics = Literal["minimum", "mean"]
+OverCritics = Literal["minimum", "smaller", "mean"]
 DrawnPer = Literal["transition", "sequence"]
 
 
