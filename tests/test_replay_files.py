@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rcdsac_trl.pipeline.replay import SequenceReplay, bytes_per_slot
-from rcdsac_trl.pipeline.replay_files import ReplayFiles
+from rcdsac_trl.pipeline.replay_files import ReplayFiles, remove_others
 from test_replay import EPISODE_STEPS, make_replay, numbered_episodes
 
 SLOTS = EPISODE_STEPS + 1
@@ -62,7 +62,7 @@ def test_files_go_when_their_episodes_have_left_and_nobody_names_them(tmp_path: 
     for _ in range(6):
         add(replay, 3)
         named.append([segment.file for segment in files.save()])
-        files.remove_others({name for names in named[-2:] for name in names})
+        remove_others(files.folder, {name for names in named[-2:] for name in names})
     starts = [[int(name[9:17]) for name in names] for names in named]
     # Seven episodes lie in three files of three, of which the oldest may hold some that have left.
     assert starts == [[0], [0, 3], [0, 3, 6], [3, 6, 9], [6, 9, 12], [9, 12, 15]]

@@ -6,9 +6,10 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
+from pkgutil import resolve_name
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,7 +25,7 @@ from rcdsac_trl import train
 from rcdsac_trl.pipeline import build
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.logs import cut, lengths
-from rcdsac_trl.pipeline.saved import folders, newest
+from rcdsac_trl.pipeline.saved import Progress, folders, newest
 from test_checkpoint import DAMAGE
 from tiny import TINY, tiny_trainer
 
@@ -262,6 +263,39 @@ def test_a_damaged_best_checkpoint_is_said_and_found_anew(copied: Path) -> None:
     trainer.run()
     assert "the next validation finds a new best one" in (copied / "train.log").read_text()
     assert newest(copied / "checkpoints")[0].progress.best_iterations == 3
+
+
+def test_a_run_that_died_before_it_removed_what_is_too_old_does_so_when_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its last checkpoint is there, so it is finished: it died before, or in the middle of, removing the oldest."""
+    run, died = tmp_path / "run", {name: tmp_path / name for name in ("rotate", "durable.shutil.rmtree")}
+    trainer = tiny_trainer(run, "rcdsac_pow", *QUICK, "checkpoint.keep=1")
+    save = trainer.checkpoints.save
+
+    def as_a_kill_leaves_it(do: Callable[..., None], copy: Path) -> Callable[..., None]:
+        def call(*args: Any, **kwargs: Any) -> None:
+            shutil.copytree(run, copy)
+            do(*args, **kwargs)
+
+        return call
+
+    def last_save(progress: Progress, logs: Any) -> Path:
+        if progress.iterations == 3:
+            for name, copy in died.items():
+                name = f"rcdsac_trl.pipeline.checkpoint.{name}"
+                monkeypatch.setattr(name, as_a_kill_leaves_it(resolve_name(name), copy))
+        return save(progress, logs)
+
+    monkeypatch.setattr(trainer.checkpoints, "save", last_save)
+    trainer.run()
+    monkeypatch.undo()
+    left = {path.name for path in (run / "checkpoints").iterdir()}
+    for copy in died.values():
+        assert {path.name for path in (copy / "checkpoints").iterdir()} > left
+        assert build.resumed(copy) is None
+        assert_equal_runs(copy, run)
+        FolderLock(copy).close()
 
 
 # ------------------------------------------------------------------------------------------------ logs

@@ -15,7 +15,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointA
 from torchrl.objectives import LossModule
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline import durable
+from rcdsac_trl.pipeline import durable, replay_files
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.saved import Name, Progress, Saved, find, folder_name, folders, record_or_none, write_record
 
@@ -81,7 +81,7 @@ class Checkpoints:
         write_record(temporary, progress, segments, logs)
         durable.publish(path)
         self.saved_iterations = progress.iterations
-        self._rotate()
+        rotate(self.folder, keep=self.keep, replay=None if self.replay is None else self.replay.folder)
         return path
 
     def size_bytes(self) -> int:
@@ -101,24 +101,35 @@ class Checkpoints:
         durable.clear_leftovers(self.folder)
         if self.replay is not None:
             self.replay.load(saved.segments)
-            self.replay.remove_others({segment.file for segment in saved.segments} | self._named_segments())
+            named = {segment.file for segment in saved.segments} | _named_segments(self.folder, self.keep)
+            replay_files.remove_others(self.replay.folder, named)
         self.saved_iterations = saved.progress.iterations
 
-    def _rotate(self) -> None:
-        newest = folders(self.folder)[-self.keep :]
-        records = [record for path in newest if (record := record_or_none(path)) is not None]
-        best = {record.progress.best_iterations for record in records}
-        kept = {path.name for path in newest} | {folder_name(number) for number in best if number is not None}
-        for path in folders(self.folder):
-            if path.name not in kept:
-                durable.remove_folder(path)
-        if self.replay is not None:
-            self.replay.remove_others(self._named_segments())
 
-    def _named_segments(self) -> set[str]:
-        """Name the files of the replay that one needs to continue from a checkpoint that stays."""
-        records = [record_or_none(path) for path in folders(self.folder)[-self.keep :]]
-        return {segment.file for record in records if record is not None for segment in record.segments}
+def rotate(folder: Path, *, keep: int, replay: Path | None) -> None:
+    """Remove the checkpoints that are too old, and the files of the replay that only they need.
+
+    Args:
+        folder: holds the checkpoints.
+        keep: how many of the newest stay; the best one they name stays as well.
+        replay: folder of the replay's files; None: the replay is not saved.
+    """
+    newest = folders(folder)[-keep:]
+    records = [record for path in newest if (record := record_or_none(path)) is not None]
+    best = {record.progress.best_iterations for record in records}
+    kept = {path.name for path in newest} | {folder_name(number) for number in best if number is not None}
+    for path in folders(folder):
+        if path.name not in kept:
+            durable.remove_folder(path)
+    durable.clear_leftovers(folder)
+    if replay is not None:
+        replay_files.remove_others(replay, _named_segments(folder, keep))
+
+
+def _named_segments(folder: Path, keep: int) -> set[str]:
+    """Name the files of the replay that one needs to continue from a checkpoint that stays."""
+    records = [record_or_none(path) for path in folders(folder)[-keep:]]
+    return {segment.file for record in records if record is not None for segment in record.segments}
 
 
 def load_weights(

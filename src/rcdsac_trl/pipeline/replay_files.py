@@ -83,11 +83,12 @@ class ReplayFiles:
             stored = TensorDict(tensors, batch_size=[segment.episodes, self.replay.episode_steps + 1])
             yield stored[max(0, oldest - segment.first_episode) :]
 
-    def remove_others(self, kept: Collection[str]) -> None:
-        """Remove the files that have none of these names."""
-        for path in self.folder.glob("*.safetensors"):
-            if path.name not in kept:
-                path.unlink()
+
+def remove_others(folder: Path, kept: Collection[str]) -> None:
+    """Remove the files of a replay's folder that have none of these names."""
+    for path in folder.glob("*.safetensors"):
+        if path.name not in kept:
+            path.unlink()
 
 
 def damage(folder: Path, segments: Sequence[Segment]) -> str | None:

@@ -25,7 +25,7 @@ from rcdsac_trl.pipeline.build.agent import (
 )
 from rcdsac_trl.pipeline.build.read import settings_of_run, training_settings
 from rcdsac_trl.pipeline.build.world import environment, evaluation_environment
-from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators
+from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators, rotate
 from rcdsac_trl.pipeline.collection import Episodes
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.evaluation import Validation
@@ -126,6 +126,8 @@ def resumed(folder: Path) -> Trainer | None:
     try:
         saved, damaged = newest(folder / CHECKPOINTS, replay=folder / REPLAY) if has_begun(folder) else (None, [])
         if saved is not None and saved.progress.iterations == settings.schedule.iterations:
+            if not damaged:  # it may have died after its last checkpoint, before what is then too old was removed
+                rotate(folder / CHECKPOINTS, keep=settings.checkpoint.keep, replay=folder / REPLAY)
             lock.close()
             return None
         return _assemble(settings, folder, lock, saved, damaged)
