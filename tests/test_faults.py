@@ -20,7 +20,6 @@ from tensordict import TensorDictBase
 from rcdsac_trl import train
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline import build, resources
-from rcdsac_trl.pipeline.cli import output_folder
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, newest
 from rcdsac_trl.world.env import make_env
 from rcdsac_trl.world.maps import MapSettings
@@ -343,9 +342,3 @@ def test_what_is_neither_disk_nor_memory_keeps_its_traceback(tmp_path: Path) -> 
     trainer.learner.replay.add_episodes = mistaken  # type: ignore[method-assign]
     with pytest.raises(FileNotFoundError):
         trainer.run()
-
-
-# ------------------------------------------------------------------------------------------------ folders
-def test_runs_started_in_the_same_second_get_folders_of_their_own() -> None:
-    given = ["+algo=rcdsac_pow"]
-    assert len({output_folder("train", given) for _ in range(3)}) == 3

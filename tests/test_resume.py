@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import Checkpoint
 
@@ -366,9 +365,14 @@ def test_a_finished_run_says_so_and_changes_nothing(command: Any, short: Path, c
     assert files_of(short) == before
 
 
+def noted_overrides(run: Path, overrides: list[str]) -> None:
+    """Write down that a run was started with these, as the command line does."""
+    manifest = run / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"overrides": overrides}))
+
+
 def test_a_folder_is_continued_as_it_was_started(command: Any, copied: Path, short: Path, tmp_path: Path) -> None:
-    (copied / ".hydra").mkdir()
-    (copied / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(START))
+    noted_overrides(copied, START)
     before = set(tmp_path.iterdir())
     # What the run was started with, and what changes nothing, may be repeated.
     command([*START, "seed=0", f"resume={unfinished(copied)}", f"hydra.run.dir={copied}"])
@@ -381,8 +385,7 @@ def test_a_folder_is_continued_as_it_was_started(command: Any, copied: Path, sho
     "override", ["learner.gamma=0.5", "schedule.iterations=9", "sensor=sparse", "+algo=sac", "hydra.run.dir=other"]
 )
 def test_what_contradicts_a_run_is_refused_by_name(refusal: Any, copied: Path, override: str) -> None:
-    (copied / ".hydra").mkdir()
-    (copied / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(START))
+    noted_overrides(copied, START)
     told = refusal([f"resume={unfinished(copied)}", override])
     assert told == (
         f"{override} is not what {copied} was started with, and resume continues a run as it was: leave it out, or "
@@ -437,7 +440,7 @@ def test_auto_finds_the_newest_unfinished_run_of_this_config_else_begins_one(
     monkeypatch.setattr(
         build,
         "trainer",
-        lambda cfg, folder: SimpleNamespace(run=lambda: begun.append(Path(folder).relative_to(tmp_path))),
+        lambda cfg, folder, overrides: SimpleNamespace(run=lambda: begun.append(Path(folder).relative_to(tmp_path))),
     )
     command([*START, "resume=auto", "hydra.run.dir=runs/new"])
     assert "resume=auto: no unfinished run of this config in runs, so a new one\n" in capsys.readouterr().out

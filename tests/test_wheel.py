@@ -63,7 +63,6 @@ def test_the_wheel_trains_outside_the_checkout(installed: Path, tmp_path: Path) 
     trained = python(installed, tmp_path, "-m", "rcdsac_trl.train", "+algo=sac", *TINY, f"hydra.run.dir={run}")
     assert trained.returncode == 0, trained.stderr
     assert {path.name for path in run.iterdir()} == {
-        ".hydra",
         "checkpoints",
         "config.yaml",
         "csv",

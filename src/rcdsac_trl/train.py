@@ -19,7 +19,7 @@ def check(cfg: DictConfig) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that already holds a run, before Hydra writes into it."""
+    """Refuse a folder that already holds a run, before Hydra makes it."""
     from rcdsac_trl.pipeline import logs
 
     logs.check_folder(folder)
@@ -45,7 +45,7 @@ def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
     from rcdsac_trl.pipeline import build
 
-    _run(build.trainer(cfg, build.run_folder()))
+    _run(build.trainer(cfg, build.run_folder(), build.given_overrides()))
 
 
 def _run(trainer: "Trainer") -> None:

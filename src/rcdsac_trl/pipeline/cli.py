@@ -43,7 +43,7 @@ def entry_point(
         config_name: the root config in ``conf/``.
         check: called with the composed config before Hydra creates a folder; raises
             :class:`~rcdsac_trl.errors.UserInputError` for what cannot work.
-        check_folder: called likewise with the folder that Hydra is about to write into.
+        check_folder: called likewise with the folder that each run would write into.
         instead: called first, with the overrides and whether there are several jobs; returns whether it did what the
             call asks for, so that Hydra has nothing to start.
     """
@@ -113,15 +113,27 @@ def precheck(
     args = read_arguments(argv)
     if args is None:
         return
-    for overrides in _jobs(args.overrides) if args.multirun else [args.overrides]:
+    jobs = _jobs(args.overrides) if args.multirun else [args.overrides]
+    for overrides in jobs:
         check(compose(config_name, overrides))
-    if check_folder is not None and not args.multirun:
-        check_folder(output_folder(config_name, args.overrides))
+    if check_folder is None:
+        return
+    folders: set[Path] = set()
+    for number, overrides in enumerate(jobs):
+        folder = output_folder(config_name, overrides, job_number=number if args.multirun else None)
+        if folder in folders:
+            raise UserInputError(f"{folder} would hold several of these runs: put what differs into hydra.sweep.subdir")
+        check_folder(folder)
+        folders.add(folder)
 
 
-def output_folder(config_name: str, overrides: list[str]) -> Path:
-    """Return the folder that Hydra would write into."""
-    return Path(_compose(config_name, overrides, return_hydra_config=True).hydra.run.dir)
+def output_folder(config_name: str, overrides: list[str], *, job_number: int | None = None) -> Path:
+    """Return the folder that a run would write into, where it is a job of a multirun as the job of that number."""
+    if job_number is None:
+        return Path(_compose(config_name, overrides, return_hydra_config=True).hydra.run.dir)
+    given = [*overrides, f"hydra.job.num={job_number}"]
+    sweep = _compose(config_name, given, return_hydra_config=True).hydra.sweep
+    return Path(sweep.dir) / str(sweep.subdir)
 
 
 def _jobs(overrides: list[str]) -> list[list[str]]:

@@ -23,8 +23,11 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.metrics import METRICS, Condition
 from rcdsac_trl.pipeline.resources import check_writable
+from rcdsac_trl.pipeline.saved import CHECKPOINTS
 
 CONFIG_NAME = "config.yaml"
+MANIFEST_NAME = "manifest.json"
+TRAINING_TABLE = "training_episodes.csv"
 _EXTRAS = {"wandb": "wandb", "mlflow": "mlflow"}
 _PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "gymnasium", "hydra-core", "numpy", "numba", "rcdsac-trl")
 
@@ -62,7 +65,8 @@ def commit() -> str:
 def check_folder(folder: Path) -> None:
     """Refuse a folder that already holds a run, or that nothing can be written into."""
     check_writable(folder)
-    if (folder / CONFIG_NAME).exists():
+    # A run whose config was lost is one too.
+    if any((folder / name).exists() for name in (CONFIG_NAME, CHECKPOINTS, TRAINING_TABLE)):
         raise UserInputError(f"{folder} already holds a run: choose another hydra.run.dir")
 
 
@@ -83,7 +87,7 @@ def start_run_folder(folder: Path, cfg: DictConfig, facts: Mapping[str, object])
         "packages": {name: version(name) for name in _PACKAGES},
         **facts,
     }
-    durable.write(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
+    durable.write(folder / MANIFEST_NAME, (json.dumps(manifest, indent=2) + "\n").encode())
     # Last: a folder that has a config is a run.
     durable.write(folder / CONFIG_NAME, OmegaConf.to_yaml(cfg, resolve=True).encode())
 

@@ -2,6 +2,15 @@
 
 from rcdsac_trl.pipeline.build.evaluation import evaluation
 from rcdsac_trl.pipeline.build.resume import run_to_continue
-from rcdsac_trl.pipeline.build.training import check_training, failure, resumed, run_folder, trainer
+from rcdsac_trl.pipeline.build.training import check_training, failure, given_overrides, resumed, run_folder, trainer
 
-__all__ = ["check_training", "evaluation", "failure", "resumed", "run_folder", "run_to_continue", "trainer"]
+__all__ = [
+    "check_training",
+    "evaluation",
+    "failure",
+    "given_overrides",
+    "resumed",
+    "run_folder",
+    "run_to_continue",
+    "trainer",
+]

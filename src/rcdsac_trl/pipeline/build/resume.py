@@ -1,5 +1,6 @@
 """Which run `resume` means; the run's own config holds, so nothing else may be asked of it."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.build.read import settings_of_run
 from rcdsac_trl.pipeline.build.training import check_training, has_begun
 from rcdsac_trl.pipeline.cli import compose, output_folder
-from rcdsac_trl.pipeline.logs import CONFIG_NAME
+from rcdsac_trl.pipeline.logs import CONFIG_NAME, MANIFEST_NAME
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, newest
 
 AUTO = "auto"
@@ -87,12 +88,12 @@ def _check_overrides(folder: Path, overrides: list[str]) -> None:
 
 
 def _own_overrides(folder: Path) -> list[str]:
-    """Read what Hydra noted of the call that started a run; nothing if that is not there any more."""
+    """Read the overrides of the call that started a run; none if they cannot be read any more."""
     try:
-        noted = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text())
-    except (OSError, ValueError, yaml.YAMLError):
+        noted = json.loads((folder / MANIFEST_NAME).read_bytes())["overrides"]
+        return [override for override in noted if _key(override) != "resume"]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return []
-    return [override for override in noted or [] if _key(override) != "resume"]
 
 
 def _changes(own: list[str], override: str) -> bool:

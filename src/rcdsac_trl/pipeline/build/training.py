@@ -1,5 +1,6 @@
 """A training run from its config."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,6 +47,11 @@ REPLAY = "replay"
 def run_folder() -> Path:
     """Return the folder Hydra made for this job."""
     return Path(HydraConfig.get().runtime.output_dir)
+
+
+def given_overrides() -> list[str]:
+    """Return the overrides Hydra was given for this job, without those of Hydra itself."""
+    return list(HydraConfig.get().overrides.task)
 
 
 def check_training(cfg: DictConfig) -> None:
@@ -98,19 +104,33 @@ def make_learner(settings: TrainingSettings, device: str) -> Learner:
     )
 
 
-def trainer(cfg: DictConfig, folder: Path) -> Trainer:
-    """Make a new training run that writes into a folder."""
+def trainer(cfg: DictConfig, folder: Path, overrides: Sequence[str] = ()) -> Trainer:
+    """Make a new training run that writes into a folder.
+
+    Args:
+        cfg: of the run.
+        folder: made if it is not there.
+        overrides: that made the config; noted for whoever continues the run.
+
+    Raises:
+        UserInputError: if another process trains in the folder, or it holds a run.
+    """
     settings = training_settings(cfg)
-    logs.check_folder(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FolderLock(folder)
     facts = {
+        "overrides": list(overrides),
         "device": runtime.resolve_device(settings.device),
         "threads": runtime.resolve_threads(settings.threads),
         "allocator": runtime.allocator(),
     }
-    logs.start_run_folder(folder, cfg, facts)
-    return _assemble(settings, folder, lock, None, [])
+    logs.check_folder(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FolderLock(folder)
+    try:
+        logs.start_run_folder(folder, cfg, facts)
+        return _assemble(settings, folder, lock, None, [])
+    except BaseException:
+        lock.close()
+        raise
 
 
 def resumed(folder: Path) -> Trainer | None:
@@ -150,7 +170,7 @@ def failure(dump: Path) -> tuple[LossModule, TensorDict]:
 
 def has_begun(folder: Path) -> bool:
     """Whether a run has saved or driven anything; one that has not can only be begun."""
-    return (folder / "training_episodes.csv").exists() or any((folder / CHECKPOINTS).glob("[!.]*"))
+    return (folder / logs.TRAINING_TABLE).exists() or any((folder / CHECKPOINTS).glob("[!.]*"))
 
 
 def _assemble(

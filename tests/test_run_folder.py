@@ -1,0 +1,125 @@
+"""A run has its folder to itself: two never meet in one, and one that is refused leaves no trace."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline import logs
+from rcdsac_trl.pipeline.cli import output_folder, precheck
+from rcdsac_trl.pipeline.saved import newest
+from tiny import AGENTS, ITERATIONS, TINY, tiny_trainer
+
+START = ["+algo=rcdsac_pow", *TINY]
+
+# Waits where nothing speaks against the folder yet until the other one has come as far.
+STARTER = """
+import sys, time
+from pathlib import Path
+from rcdsac_trl import train
+from rcdsac_trl.pipeline import logs
+
+mine, other = Path(sys.argv.pop(1)), Path(sys.argv.pop(1))
+check_folder = logs.check_folder
+
+def checked_by_both(folder):
+    check_folder(folder)
+    mine.touch()
+    while not other.exists():
+        time.sleep(0.01)
+
+logs.check_folder = checked_by_both
+train.main()
+"""
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_of_two_starts_in_one_folder_one_trains_and_the_other_leaves_no_trace(tmp_path: Path) -> None:
+    run, flags = tmp_path / "run", [tmp_path / "first", tmp_path / "second"]
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", STARTER, *map(str, pair), *START, f"seed={seed}", f"hydra.run.dir={run}"],
+            env=os.environ | {"PYTHONPATH": path, "MALLOC_MMAP_MAX_": "0", "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for seed, pair in enumerate((flags, flags[::-1]))
+    ]
+    errors = [process.communicate(timeout=300)[1] for process in started]
+    codes = [process.returncode for process in started]
+    assert sorted(codes) == [0, 2], errors
+    winner, loser = codes.index(0), codes.index(2)
+    assert errors[loser] in (
+        f"rcdsac_trl: {run} is being trained in by another process: wait for it, or stop it\n",
+        f"rcdsac_trl: {run} already holds a run: choose another hydra.run.dir\n",
+    )
+    assert {path.name for path in run.iterdir()} == {
+        "checkpoints",
+        "config.yaml",
+        "lock",
+        "manifest.json",
+        "replay",
+        "train.log",
+        "training_episodes.csv",
+        "validation_episodes.csv",
+    }
+    assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == winner
+    manifest = json.loads((run / "manifest.json").read_text())
+    assert manifest["seed"] == winner
+    assert manifest["overrides"] == [*START, f"seed={winner}"]
+    assert (run / "train.log").read_text().count("iterations; write to") == 1
+    assert len(pd.read_csv(run / "training_episodes.csv")) == AGENTS * ITERATIONS
+    assert newest(run / "checkpoints", replay=run / "replay")[1] == []
+
+
+@pytest.mark.parametrize("left", ["config.yaml", "checkpoints", "training_episodes.csv"])
+def test_a_folder_that_holds_a_part_of_a_run_holds_a_run(tiny_run: Path, tmp_path: Path, left: str) -> None:
+    (tmp_path / left).symlink_to(tiny_run / left)
+    before = files_of(tmp_path)
+    with pytest.raises(UserInputError, match="already holds a run: choose another"):
+        tiny_trainer(tmp_path)
+    assert files_of(tmp_path) == before
+
+
+def test_runs_started_in_the_same_second_get_folders_of_their_own() -> None:
+    given = ["+algo=rcdsac_pow"]
+    assert len({output_folder("train", given) for _ in range(3)}) == 3
+
+
+@pytest.fixture
+def multirun(tmp_path: Path) -> Callable[..., None]:
+    def check(*arguments: str) -> None:
+        given = ["-m", "+algo=sac", "seed=0,1", f"hydra.sweep.dir={tmp_path}", *arguments]
+        precheck("train", given, lambda cfg: None, logs.check_folder)
+
+    return check
+
+
+def test_no_job_of_a_multirun_starts_if_one_of_their_folders_is_taken(
+    multirun: Callable[..., None], tmp_path: Path
+) -> None:
+    multirun()
+    taken = tmp_path / "1-sac-narrow-s1"
+    taken.mkdir()
+    (taken / "config.yaml").touch()
+    with pytest.raises(UserInputError, match=f"^{taken} already holds a run: choose another"):
+        multirun()
+    multirun("hydra.sweep.subdir=other-${hydra.job.num}")
+
+
+def test_jobs_of_a_multirun_never_share_a_folder(multirun: Callable[..., None], tmp_path: Path) -> None:
+    told = f"^{tmp_path}/a-sac would hold several of these runs: put what differs into hydra.sweep.subdir$"
+    with pytest.raises(UserInputError, match=told):
+        multirun("hydra.sweep.subdir=a-${algo.name}")
