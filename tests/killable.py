@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from rcdsac_trl.pipeline import build
+from rcdsac_trl.pipeline import build, drivers
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.replay import SequenceReplay
 from rcdsac_trl.pipeline.trainer import Learner
@@ -39,6 +39,7 @@ class Events:
 
     def __init__(self, kill_at: tuple[str, int] | None) -> None:
         self.kill_at = kill_at
+        self.process = os.getpid()
         self.counted = {"saving": 0, "training": 0}
         for kind, watched in (("saving", SAVING), ("training", TRAINING)):
             for owner, name in watched:
@@ -46,7 +47,7 @@ class Events:
 
     def watched(self, function: Callable[..., Any], kind: str) -> Callable[..., Any]:
         def call(*args: Any, **kwargs: Any) -> Any:
-            if (kind, self.counted[kind]) == self.kill_at:
+            if (kind, self.counted[kind]) == self.kill_at and os.getpid() == self.process:
                 os.kill(os.getpid(), signal.SIGKILL)
             self.counted[kind] += 1
             return function(*args, **kwargs)
@@ -73,14 +74,17 @@ def work(job: dict[str, Any]) -> None:
 def main() -> None:
     """Do jobs until standard input ends; answer each with the status of its process."""
     torch.set_num_threads(1)
+    drivers.START_METHOD = "fork"  # a fork server would import everything for each job anew
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what trainings print goes elsewhere
     with TemporaryDirectory() as folder:  # what is compiled and which maps are made, all forks then have
         tiny_trainer(Path(folder), "rcdsac_pow", *json.loads(sys.argv[1]), "logger=none").run()
     for line in sys.stdin:
         job = json.loads(line)
+        alive, held = os.pipe()
         child = os.fork()
         if child == 0:
+            os.close(alive)
             log = os.open(job["out"] + ".log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
@@ -93,7 +97,11 @@ def main() -> None:
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(code)
-        answers.write(f"{os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])}\n")
+        os.close(held)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        os.read(alive, 1)  # until whatever the job had started has ended, too
+        os.close(alive)
+        answers.write(f"{status}\n")
         answers.flush()
 
 

@@ -1,6 +1,5 @@
 """Evaluation: the same maps for everyone, deterministic actions, the same files twice, numbers that add up."""
 
-import importlib
 import json
 import multiprocessing
 import shutil
@@ -20,6 +19,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import build, evaluation
+from rcdsac_trl.pipeline.build import driver
 from rcdsac_trl.pipeline.build.agent import make_average, make_loss
 from rcdsac_trl.pipeline.build.world import evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_weights
@@ -27,8 +27,9 @@ from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.evaluation import EvaluationRun, run_episodes
 from rcdsac_trl.pipeline.metrics import METRICS, Condition
 from rcdsac_trl.pipeline.policies import PursuitPolicy
-from rcdsac_trl.pipeline.saved import load_progress
+from rcdsac_trl.pipeline.saved import Progress, load_progress
 from rcdsac_trl.pipeline.settings import WorldSettings
+from rcdsac_trl.pipeline.validation import Snapshot
 from rcdsac_trl.world.env import make_env
 from tiny import evaluate, tiny_settings, tiny_trainer
 
@@ -364,16 +365,21 @@ def test_the_pursuit_baseline_drives_without_any_run(tmp_path: Path, monkeypatch
     assert contents(evaluate("baseline=pursuit", *small, "out=again")) == contents(out)
 
 
-def test_a_validation_repeats_itself_and_follows_the_agent(tmp_path: Path) -> None:
+def test_a_validation_repeats_itself_and_follows_its_snapshot(tmp_path: Path) -> None:
     trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "validation.num_maps=2")
-    first, again = trainer.validate(), trainer.validate()
-    pd.testing.assert_frame_equal(first, again)
-    with torch.no_grad():  # the weights are the learner's own average, not a copy
+
+    def measured(actor: bytes) -> pd.DataFrame:
+        trainer.validate.start(Snapshot(Progress(), actor), alone=False)
+        return trainer.validate.finish()
+
+    before = trainer.learner.averaged_actor()
+    first = measured(before)
+    with torch.no_grad():
         for value in trainer.learner.average.module.parameters():
             value.mul_(3.0)
-    assert not trainer.validate()["reward"].equals(first["reward"])
+    pd.testing.assert_frame_equal(first, measured(before))  # the snapshot stays what it was
+    assert not measured(trainer.learner.averaged_actor())["reward"].equals(first["reward"])
     trainer.validate.close()
-    trainer.validate.close()  # once more does no harm
     trainer.episodes.close()
     trainer.log.close()
     trainer.lock.close()
@@ -388,9 +394,7 @@ def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> Non
 
 def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     closed: list[bool] = []
-    # By its name, because the package exports a function of the module's name.
-    module = importlib.import_module("rcdsac_trl.pipeline.build.evaluation")
-    original: Callable[..., EnvBase] = module.evaluation_environment
+    original: Callable[..., EnvBase] = driver.evaluation_environment
 
     def watched(*arguments: Any) -> EnvBase:
         env = original(*arguments)
@@ -398,6 +402,6 @@ def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeyp
         monkeypatch.setattr(env, "close", lambda **kwargs: (closed.append(True), close(**kwargs)))
         return env
 
-    monkeypatch.setattr(module, "evaluation_environment", watched)
+    monkeypatch.setattr(driver, "evaluation_environment", watched)
     evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     assert closed == [True]

@@ -1,6 +1,7 @@
 """Worker processes die and hang, disks are full, memory ends: one sentence, and the last checkpoint is whole."""
 
 import errno
+import multiprocessing
 import os
 import re
 import shutil
@@ -21,7 +22,7 @@ from rcdsac_trl import train
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline import build, resources
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, newest
-from rcdsac_trl.world.env import make_env
+from rcdsac_trl.world.env import NavigationEnv, make_env
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.workers import WorkerError, Workers
 from tiny import STEPS, TINY, tiny_trainer
@@ -79,18 +80,32 @@ def test_a_run_goes_on_after_a_worker_was_killed(tmp_path: Path, signalled: Call
     )
 
 
-@pytest.mark.slow
 def test_a_validation_after_a_fault_is_what_it_would_have_been(
-    tmp_path: Path, tiny_run: Path, signalled: Callable[..., None]
+    tmp_path: Path, tiny_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("rcdsac_trl.pipeline.drivers.START_METHOD", "fork")  # starts at once
+    step = NavigationEnv._step
+    left = iter(tmp_path / f"killed{number}" for number in range(2))
+    main = os.getpid()
+
+    def dying(self: NavigationEnv, tensordict: TensorDictBase) -> TensorDictBase:
+        if os.getpid() != main and (at := next(left, None)) is not None and not at.exists():
+            at.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(self, tensordict)
+
+    monkeypatch.setattr(NavigationEnv, "_step", dying)
     run = tmp_path / "run"
-    signalled("validation", [3, 5 + STEPS])
-    tiny_trainer(run, "rcdsac_pow", "world.num_workers=2").run()
+    tiny_trainer(run, "rcdsac_pow", "validation.processes=1").run()
     for table in ("training_episodes.csv", "validation_episodes.csv"):
         assert (run / table).read_bytes() == (tiny_run / table).read_bytes()
     told = (run / "train.log").read_text()
-    assert told.count("(split validation, seed 0, agents 0, 1, 0, 1) was killed by SIGKILL; restart") == 2
+    for number in (1, 2):
+        killed = "validation after 1 iterations: driving process 1 of 1 was killed by SIGKILL; restart"
+        assert f"{killed} {number} of at most 5\n" in told
     assert "dropped" not in told
+    assert newest(run / CHECKPOINTS)[0].progress.restarts == 2
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow

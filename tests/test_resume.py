@@ -37,6 +37,7 @@ RUN = [
     "schedule.pursuit_iterations=2",
     "replay.capacity_steps=140",
     "validation.every_iterations=2",
+    "validation.processes=1",
     "learner.actor_average_decay=0.9",
     "learner.resample_per=transition",
     "algo.distortion.evaluation_betas=[-1]",
@@ -133,11 +134,15 @@ def states(checkpoint: Path) -> dict[str, torch.Tensor]:
 
 
 def scalars_shown(run: Path) -> dict[str, list[tuple[int, float]]]:
-    """What TensorBoard shows, without what depends on the clock."""
+    """What TensorBoard shows, without what depends on the clock, and each point once.
+
+    A validation's points are as old as its agent: a run that is killed after they were written, but before that was
+    saved, writes them again.
+    """
     shown = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0})
     shown.Reload()
     tags = [tag for tag in shown.Tags()["scalars"] if not tag.startswith("time/")]
-    return {tag: [(event.step, event.value) for event in shown.Scalars(tag)] for tag in tags}
+    return {tag: sorted({(event.step, event.value) for event in shown.Scalars(tag)}) for tag in tags}
 
 
 def assert_equal_runs(run: Path, whole: Path) -> None:
@@ -178,6 +183,48 @@ def test_a_run_killed_again_and_again_ends_as_if_nothing_had_happened(
     assert scalars_shown(tmp_path / "run") == scalars_shown(whole[0])
 
 
+def test_a_run_that_validates_in_place_is_the_same(server: Server, whole: tuple[Path, Counted], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    server.call("train", run, overrides=[*RUN, "validation.processes=0"], evaluate=["best", "last"])
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace("processes: 0", "processes: 1"))
+    assert_equal_runs(run, whole[0])
+    assert scalars_shown(run) == scalars_shown(whole[0])
+
+
+@pytest.fixture(scope="module")
+def under_way(server: Server, whole: tuple[Path, Counted], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was killed when it had saved three iterations; the agent after two was being validated."""
+    run = tmp_path_factory.mktemp("under way") / "run"
+    events, step = whole[1]["training"], 1
+    while not (run / "checkpoints" / "iteration-000003").exists():
+        shutil.rmtree(run, ignore_errors=True)
+        assert server.call("train", run, kill_at=("training", events * step // 20)) is None
+        step += 1
+    return run
+
+
+def test_the_agent_under_validation_stays_until_its_result_is_in(
+    server: Server, whole: tuple[Path, Counted], under_way: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(under_way, tmp_path / "run"))
+    assert [path.name[-1] for path in folders(run / "checkpoints")] == ["2", "3"]
+    assert newest(run / "checkpoints")[0].progress.validating_iterations == 2
+    assert not (run / "validation_episodes.csv").exists()
+    server.call("resume", run, evaluate=["best", "last"])
+    assert_equal_runs(run, whole[0])
+
+
+def test_a_validation_whose_agent_is_damaged_is_left_out(server: Server, under_way: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(under_way, tmp_path / "run"))
+    damaged = run / "checkpoints" / "iteration-000002"
+    (damaged / "manifest.json").unlink()
+    server.call("resume", run)
+    told = f"checkpoint {damaged} is damaged: manifest.json is missing; its validation was under way and is left out\n"
+    assert told in (run / "train.log").read_text()
+    assert pd.read_csv(run / "validation_episodes.csv")["iteration"].unique().tolist() == [3, 4]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ["sac", "rcwr", "rcdsac_cvar_stored", "dsac_pow"])
 def test_every_kind_of_row_goes_on(server: Server, tmp_path: Path, row: str) -> None:
@@ -201,7 +248,13 @@ def test_a_run_killed_once_ends_as_if_nothing_had_happened(
 
 
 # ------------------------------------------------------------------------------------------------ damage, in a real run
-QUICK = [*RUN, "schedule.iterations=3", "validation.every_iterations=1", "logger.backends=[csv]"]
+QUICK = [
+    *RUN,
+    "schedule.iterations=3",
+    "validation.every_iterations=1",
+    "validation.processes=0",
+    "logger.backends=[csv]",
+]
 
 
 @pytest.fixture(scope="module")

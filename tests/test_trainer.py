@@ -25,6 +25,7 @@ from rcdsac_trl.pipeline.metrics import METRICS
 from rcdsac_trl.pipeline.saved import Progress, load_progress
 from rcdsac_trl.pipeline.settings import Schedule
 from rcdsac_trl.pipeline.trainer import LOSS_KEYS, Learner, Trainer
+from rcdsac_trl.pipeline.validation import Snapshot
 from rcdsac_trl.world import episode
 from rcdsac_trl.world.env import NavigationEnv, make_env
 from rcdsac_trl.world.shapes import Map
@@ -74,9 +75,10 @@ class Collector:
 class StubLearner(Learner):
     """Notes what it is asked for."""
 
-    def __init__(self, events: list[Any], interrupt_in: int | None = None) -> None:
+    def __init__(self, events: list[Any], interrupt_in: int | None = None, begun_after: int = 0) -> None:
         self.events = events
         self.interrupt_in = interrupt_in
+        self.begun_after = begun_after
         self.calls = 0
         self.replay = self  # type: ignore[assignment]
 
@@ -91,20 +93,37 @@ class StubLearner(Learner):
         self.events.append(("update", number, distortion_strength, learning_rate_share))
         return {"loss_qvalue": 1.0}
 
+    def averaged_actor(self) -> bytes:
+        return b"actor after %d iterations" % (self.begun_after + self.calls)
+
 
 class StubValidation:
-    """Returns episodes of two conditions whose mean reward is the next of some scores."""
+    """Finds episodes of two conditions whose mean reward is the next of some scores."""
 
-    def __init__(self, events: list[Any], scores: Sequence[float]) -> None:
+    def __init__(self, events: list[Any], scores: Sequence[float], beside: bool) -> None:
         self.events = events
         self.scores = iter(scores)
         self.steps = 4
+        self.beside = beside
+        self.snapshot: Snapshot | None = None
 
-    def __call__(self) -> pd.DataFrame:
-        self.events.append("validate")
+    def start(self, snapshot: Snapshot, *, alone: bool) -> None:
+        assert self.snapshot is None
+        assert snapshot.actor == b"actor after %d iterations" % snapshot.progress.iterations
+        self.snapshot = snapshot
+        self.events.append(("validate", snapshot.progress.iterations, "alone" if alone else "beside"))
+
+    def look(self) -> None:
+        if self.snapshot is not None:
+            self.events.append("look")
+
+    def finish(self) -> pd.DataFrame:
+        assert self.snapshot is not None
+        self.events.append(("validated", self.snapshot.progress.iterations))
         score = next(self.scores)
         if math.isnan(score):
-            raise WorkerError("worker process 1 of 1 gave no answer within 1 s")
+            raise WorkerError("driving process 1 of 1 made no step within 1 s")
+        self.snapshot = None
         rows = pd.DataFrame({"beta": [-2.0, -2.0, -1.0], "collision_weight": [math.nan] * 3})
         # Conditions count alike, however many episodes they have.
         rows[METRIC_COLUMNS] = 0.0
@@ -168,6 +187,8 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
     parts = {
         "scores": range(100),
         "validate_every": 1,
+        "beside": False,
+        "pending": None,
         "checkpoint_every": 100,
         "interrupt_in": None,
         "fail_in": None,
@@ -183,10 +204,11 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
             iteration=parts["progress"].iterations,
             map_index=parts["progress"].iterations + parts["progress"].skipped_maps,
         ),
-        learner=StubLearner(events, parts["interrupt_in"]),
+        learner=StubLearner(events, parts["interrupt_in"], parts["progress"].iterations),
         guard=StubGuard(events, parts["fail_in"]),  # type: ignore[arg-type]
-        validate=StubValidation(events, parts["scores"]),  # type: ignore[arg-type]
+        validate=StubValidation(events, parts["scores"], parts["beside"]),  # type: ignore[arg-type]
         validate_every=parts["validate_every"],
+        pending=parts["pending"],
         checkpoints=StubCheckpoints(events),  # type: ignore[arg-type]
         checkpoint_every=parts["checkpoint_every"],
         log=RunLog(folder, []),
@@ -205,7 +227,8 @@ def test_an_iteration_collects_stores_updates_validates_and_saves_in_this_order(
     stub_trainer(tmp_path, events, schedule={"iterations": 1}).run()
     names = [event if isinstance(event, str) else event[0] for event in events]
     assert names == [
-        *("save", "iteration", "collect", "check episodes", "store", "update", "check updates", "validate", "save"),
+        *("save", "iteration", "collect", "check episodes", "store", "update", "check updates", "validate"),
+        *("validated", "save"),
         *("collector closed", "validation closed", "lock open"),
     ]
 
@@ -271,6 +294,52 @@ def test_best_is_the_highest_validation_score(tmp_path: Path) -> None:
     ]
 
 
+def test_what_runs_beside_is_taken_in_when_the_next_is_due_and_changes_nothing(tmp_path: Path) -> None:
+    ran: dict[bool, list[Any]] = {True: [], False: []}
+    logged: dict[bool, list[tuple[int, float]]] = {True: [], False: []}
+    scores = [-50.0, -20.0, -30.0]
+    for beside, events in ran.items():
+        (tmp_path / str(beside)).mkdir()
+        trainer = stub_trainer(tmp_path / str(beside), events, beside=beside, scores=scores, validate_every=2)
+        scalars = logged[beside]
+        trainer.log.scalars = lambda values, step, scalars=scalars: scalars.extend(  # type: ignore[method-assign]
+            (step, values[key]) for key in values if key == "validation/score"
+        )
+        trainer.run()
+        assert (trainer.progress.best_score, trainer.progress.best_iterations) == (-20.0, 4)
+    kept = ("update", "validate", "look", "validated")
+    assert [event for event in ran[True] if event[0] in kept or event in kept] == [
+        *(("update", 3, 0.0, 1.0), ("update", 3, 0.5, 1.0), ("validate", 2, "beside")),
+        *(("update", 3, 1.0, 1.0), "look", ("update", 3, 1.0, 0.75), ("validated", 2), ("validate", 4, "beside")),
+        *(("update", 3, 1.0, 0.5), ("validated", 4), ("validate", 5, "alone"), ("validated", 5)),
+    ]
+    # What is found stands where it belongs, whenever it was found.
+    assert logged[True] == logged[False] == [(16, -50.0), (32, -20.0), (40, -30.0)]
+    name = "validation_episodes.csv"
+    assert (tmp_path / "True" / name).read_bytes() == (tmp_path / "False" / name).read_bytes()
+    # The agent under validation is in a checkpoint that names it, until the one that knows the result.
+    saved = [event[1] for event in kinds(ran[True], "save")]
+    assert [(p.iterations, p.validating_iterations, p.best_iterations) for p in saved] == [
+        (0, None, None), (2, 2, None), (4, 4, 2), (5, None, 4),
+    ]  # fmt: skip
+    told = (tmp_path / "True" / "train.log").read_text()
+    assert told.index("validation after 2 iterations") > told.index("   3/5") > told.index("   2/5")
+
+
+def test_a_run_goes_on_with_the_validation_that_was_under_way(tmp_path: Path) -> None:
+    events: list[Any] = []
+    snapshot = Snapshot(Progress(2, 16, 6, validating_iterations=2), b"actor after 2 iterations")
+    done = Progress(3, 24, 9, validating_iterations=2)
+    trainer = stub_trainer(tmp_path, events, progress=done, pending=snapshot, validate_every=2, beside=True)
+    trainer.run()
+    assert [event for event in events if event[0] in ("validate", "validated", "collect")] == [
+        *(("validate", 2, "beside"), ("collect", 3, 3), ("validated", 2), ("validate", 4, "beside")),
+        *(("collect", 4, 4), ("validated", 4), ("validate", 5, "alone"), ("validated", 5)),
+    ]
+    rows = pd.read_csv(tmp_path / "validation_episodes.csv")
+    assert rows[["iteration", "updates"]].drop_duplicates().to_numpy().tolist() == [[1, 6], [3, 12], [4, 15]]
+
+
 def test_ctrl_c_drops_the_iteration_and_closes_everything(tmp_path: Path) -> None:
     events: list[Any] = []
     trainer = stub_trainer(tmp_path, events, interrupt_in=2, validate_every=100, checkpoint_every=1)
@@ -308,13 +377,14 @@ def test_training_metrics_are_logged_for_all_and_for_each_half_of_beta(tmp_path:
     records: list[dict[str, float]] = []
     trainer.log.scalars = lambda values, step: records.append({"step": step, **values})  # type: ignore[method-assign]
     trainer.run()
+    records = [record for record in records if "validation/score" not in record]
     # Of the two agents the averse one (beta -2) is the second, whose reward is 40 in iteration 1.
     reward = [
         {key.partition("reward")[2]: record[key] for key in record if "train/reward" in key} for record in records
     ]
     assert reward[0] == {"": 0.0, "/low_beta": 0.0, "/high_beta": 0.0}
     assert reward[1] == {"": 22.0, "/low_beta": 40.0, "/high_beta": 4.0}
-    assert [record["step"] for record in records] == [8, 16]
+    assert [record["step"] for record in records] == [8, 16]  # one row an iteration
 
 
 def test_validation_episodes_stand_under_the_updates_before_them(tmp_path: Path) -> None:
@@ -482,7 +552,8 @@ def test_one_agent_alone_trains_too(tmp_path: Path) -> None:
     records: list[dict[str, float]] = []
     trainer.log.scalars = lambda values, step: records.append(dict(values))  # type: ignore[method-assign, assignment]
     trainer.run()
-    assert all(math.isfinite(value) for value in records[0].values())
+    assert len(records) == 2  # of the validation and of the iteration
+    assert all(math.isfinite(value) for record in records for value in record.values())
 
 
 @pytest.mark.parametrize("row", ["rcdsac_pow", "rcwr"])
@@ -593,11 +664,11 @@ def test_a_validation_whose_workers_fail_begins_again(tmp_path: Path) -> None:
     events: list[Any] = []
     stub_trainer(tmp_path, events, scores=[1.0, math.nan, math.nan, 2.0], validate_every=2, checkpoint_every=1,
                  schedule={"iterations": 4}).run()  # fmt: skip
-    assert events.count("validate") == 4
+    assert kinds(events, "validated") == [("validated", 2)] + [("validated", 4)] * 3
     last = kinds(events, "save")[-1][1]
     assert (last.best_score, last.best_iterations, last.restarts, last.skipped_maps) == (2.0, 4, 2, 0)
     assert (
-        "iteration 3, validation: worker process 1 of 1 gave no answer within 1 s; restart 2 of at most 3"
+        "validation after 4 iterations: driving process 1 of 1 made no step within 1 s; restart 2 of at most 3"
         in (tmp_path / "train.log").read_text()
     )
 

@@ -34,6 +34,7 @@ TINY = [
     "learner.sequence_length=4",
     "learner.batch_size=2",
     "validation.num_maps=1",
+    "validation.processes=0",
     "threads=1",
     "logger=none",
 ]

@@ -17,7 +17,17 @@ from torchrl.objectives import LossModule
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import durable, replay_files
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
-from rcdsac_trl.pipeline.saved import Name, Progress, Saved, find, folder_name, folders, record_or_none, write_record
+from rcdsac_trl.pipeline.saved import (
+    Name,
+    Progress,
+    Saved,
+    checked,
+    find,
+    folder_name,
+    folders,
+    record_or_none,
+    write_record,
+)
 
 # What a checkpoint holds beside its tensors.
 _ROOM_BYTES = 1 << 20
@@ -46,7 +56,8 @@ class Checkpoints:
         folder: where checkpoints go.
         components: what is saved, by name; each has ``state_dict`` and ``load_state_dict``.
         replay: the files of the replay, which checkpoints name; None: the replay is not saved.
-        keep: how many of the newest checkpoints stay; the best one they name stays as well.
+        keep: how many of the newest checkpoints stay; those they name, the best one and the one whose validation is
+            under way, stay as well.
 
     Attributes:
         saved_iterations: iterations done at the last checkpoint that was saved or restored; None before.
@@ -111,13 +122,15 @@ def rotate(folder: Path, *, keep: int, replay: Path | None) -> None:
 
     Args:
         folder: holds the checkpoints.
-        keep: how many of the newest stay; the best one they name stays as well.
+        keep: how many of the newest stay; those they name, the best one and the one whose validation is under way,
+            stay as well.
         replay: folder of the replay's files; None: the replay is not saved.
     """
     newest = folders(folder)[-keep:]
     records = [record for path in newest if (record := record_or_none(path)) is not None]
-    best = {record.progress.best_iterations for record in records}
-    kept = {path.name for path in newest} | {folder_name(number) for number in best if number is not None}
+    named = {record.progress.best_iterations for record in records}
+    named |= {record.progress.validating_iterations for record in records}
+    kept = {path.name for path in newest} | {folder_name(number) for number in named if number is not None}
     for path in folders(folder):
         if path.name not in kept:
             durable.remove_folder(path)
@@ -147,6 +160,18 @@ def load_weights(
     wanted = {"loss": loss, "average": average}
     _load(Checkpoint(**{key: module for key, module in wanted.items() if module is not None}), saved.path)
     return damaged
+
+
+def load_average(path: Path, average: AveragedModel) -> Saved:
+    """Load the averaged actor of one checkpoint, and return the checkpoint's record.
+
+    Raises:
+        DamagedError: if the checkpoint is not whole.
+        UserInputError: if it is of another shape.
+    """
+    saved = checked(path)
+    _load(Checkpoint(average=average), path)
+    return saved
 
 
 def _tensor_bytes(state: Any) -> int:

@@ -20,13 +20,18 @@ from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.metrics import METRICS, Condition, episode_metrics, summarise
 from rcdsac_trl.pipeline.resources import check_writable
-from rcdsac_trl.world.workers import WorkerError
 
 # What an episode's row needs; everything else of a step is dropped at once.
 _KEPT = [("next", key) for key in ("contact", "goal_reached", "reward_components", "velocity")]
 
 
-def run_episodes(env: EnvBase, policy: TensorDictModuleBase, steps: int, episode: int | None = None) -> TensorDictBase:
+def run_episodes(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    steps: int,
+    episode: int | None = None,
+    before_step: Callable[[], None] = interruption_point,
+) -> TensorDictBase:
     """Drive one episode in every agent of the env.
 
     Args:
@@ -34,6 +39,7 @@ def run_episodes(env: EnvBase, policy: TensorDictModuleBase, steps: int, episode
         policy: writes `action`.
         steps: length of an episode.
         episode: number of the episode and its map; None: the env's next one.
+        before_step: called before each step.
 
     Returns:
         TensorDict ``[N, steps]`` with the keys that :func:`episode_metrics` reads; N counts the env's agents in
@@ -42,7 +48,7 @@ def run_episodes(env: EnvBase, policy: TensorDictModuleBase, steps: int, episode
     tensordict = env.reset() if episode is None else env.reset(episode=episode)
     kept = []
     for _ in range(steps):
-        interruption_point()
+        before_step()
         tensordict = env.step(policy(tensordict))
         kept.append(tensordict.select(*_KEPT).flatten())
         tensordict = env.step_mdp(tensordict)
@@ -59,6 +65,7 @@ def measure_map(
     steps: int,
     sampled: bool = False,
     episode: int | None = None,
+    before_step: Callable[[], None] = interruption_point,
 ) -> Rows:
     """Measure a policy on one map.
 
@@ -72,13 +79,14 @@ def measure_map(
         steps: length of an episode.
         sampled: draw actions instead of taking tanh(mean).
         episode: see :func:`run_episodes`.
+        before_step: called before each step.
 
     Returns:
         One row an episode: `beta`, `collision_weight`, `map`, `episode` and :data:`METRICS`.
     """
     kind = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
-        measured = episode_metrics(run_episodes(env, policy, steps, episode))
+        measured = episode_metrics(run_episodes(env, policy, steps, episode, before_step))
     rows = []
     for i in range(len(conditions) * num_agents):
         condition = conditions[i // num_agents]
@@ -97,75 +105,6 @@ def table_of(maps: Iterable[Rows]) -> pd.DataFrame:
     rows = [row for rows in maps for row in rows]
     table = pd.DataFrame(rows).astype({"beta": float, "collision_weight": float})
     return table.sort_values(["beta", "collision_weight", "map", "episode"], ignore_index=True)
-
-
-class Validation:
-    """Measures a policy on the same maps at every call, for as long as it trains.
-
-    Args:
-        make_env: makes what :func:`measure_map` drives in, now and after every fault; closed by :meth:`close`.
-        policy: acts; its weights may change between calls.
-        conditions: what the agents of each block are told.
-        num_agents: episodes a map and a condition.
-        num_maps: maps to drive on.
-        steps: length of an episode.
-        seed: root seed of the maps.
-    """
-
-    def __init__(
-        self,
-        make_env: Callable[[], EnvBase],
-        policy: TensorDictModuleBase,
-        *,
-        conditions: Sequence[Condition],
-        num_agents: int,
-        num_maps: int,
-        steps: int,
-        seed: int,
-    ) -> None:
-        self._make_env = make_env
-        self._env: EnvBase | None = make_env()
-        self.policy = policy
-        self.conditions = conditions
-        self.num_agents = num_agents
-        self.num_maps = num_maps
-        self.steps = steps
-        self.seed = seed
-
-    def __call__(self) -> pd.DataFrame:
-        """Return one row an episode, see :func:`measure_map`.
-
-        Raises:
-            WorkerError: if a worker process died or hung; the next call begins in a new environment.
-        """
-        try:
-            if self._env is None:
-                self._env = self._make_env()
-            return self._measure(self._env)
-        except WorkerError:
-            self.close()
-            raise
-
-    def _measure(self, env: EnvBase) -> pd.DataFrame:
-        env.set_seed(self.seed)
-        return table_of(
-            measure_map(
-                env,
-                self.policy,
-                conditions=self.conditions,
-                num_agents=self.num_agents,
-                map_index=map_index,
-                steps=self.steps,
-            )
-            for map_index in range(self.num_maps)
-        )
-
-    def close(self) -> None:
-        """Close the environment, and bear that its workers may be gone."""
-        if self._env is not None:
-            with contextlib.suppress(RuntimeError, OSError):
-                self._env.close(raise_if_closed=False)
-        self._env = None
 
 
 def _without_commit(described: str) -> dict[str, Any]:

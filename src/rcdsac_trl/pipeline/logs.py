@@ -181,12 +181,12 @@ class RunLog:
         bar.set_postfix_str(rates, refresh=False)
         bar.update()
 
-    def validation(self, means: pd.DataFrame) -> None:
-        """Show validation, one line a condition."""
+    def validation(self, iterations: int, means: pd.DataFrame) -> None:
+        """Show the validation of the agent after some iterations, one line a condition."""
         for row in means.to_dict("records"):
             beta, weight = (None if row[k] != row[k] else row[k] for k in ("beta", "collision_weight"))
             values = "  ".join(f"{metric} {row[metric]:.3g}" for metric in METRICS)
-            self.message(f"     validation {Condition(beta, weight)!s:>10}  {values}")
+            self.message(f"     validation after {iterations} iterations {Condition(beta, weight)!s:>10}  {values}")
 
     def close(self) -> None:
         """Close what is open, on a full disk too."""

@@ -64,11 +64,14 @@ class ValidationSettings:
 
     every_iterations: int
     num_maps: int
+    processes: Workers
 
     def __post_init__(self) -> None:
-        """Refuse what is below 1."""
+        """Refuse what is below its limit."""
         _check_least("validation.every_iterations", self.every_iterations, 1)
         _check_least("validation.num_maps", self.num_maps, 1)
+        if self.processes != "auto":
+            _check_least("validation.processes", self.processes, 0)
 
 
 @dataclass(frozen=True)

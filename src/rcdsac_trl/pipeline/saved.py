@@ -41,6 +41,7 @@ class Progress:
         best_iterations: iterations done when it was reached.
         restarts: how often worker processes died or hung.
         skipped_maps: training maps that were given up for that; iteration i is on map i + skipped_maps.
+        validating_iterations: iterations done by the agent whose validation is under way; None: there is none.
     """
 
     iterations: int = 0
@@ -51,6 +52,7 @@ class Progress:
     best_iterations: int | None = None
     restarts: int = 0
     skipped_maps: int = 0
+    validating_iterations: int | None = None
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """The training loop: a new map and its episodes, then updates; look at the agent, save it, say how it goes."""
 
 import contextlib
-import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import pandas as pd
 import torch
@@ -18,17 +19,18 @@ from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.checkpoint import Checkpoints
 from rcdsac_trl.pipeline.collection import Episodes
 from rcdsac_trl.pipeline.durable import FolderLock
-from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.guard import FiniteGuard
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.logs import RunLog
-from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics, validation_score
+from rcdsac_trl.pipeline.metrics import METRICS, episode_metrics
 from rcdsac_trl.pipeline.replay import SequenceReplay
 from rcdsac_trl.pipeline.resources import fault_sentence
 from rcdsac_trl.pipeline.saved import Progress
 from rcdsac_trl.pipeline.settings import Schedule
+from rcdsac_trl.pipeline.validation import Snapshot, Validation, packed, scores
 from rcdsac_trl.world.workers import WorkerError
 
+T = TypeVar("T")
 LOSS_KEYS = ("loss_qvalue", "loss_actor", "loss_alpha")
 
 
@@ -103,6 +105,10 @@ class Learner:
                 sums[key] = sums[key] + value if key in sums else value.clone()
         return {key: (value / number).item() for key, value in sums.items()}
 
+    def averaged_actor(self) -> bytes:
+        """Return the weights of the averaged actor as they are now, see :func:`packed`."""
+        return packed(self.average.module)
+
 
 class Trainer:
     """Runs a :class:`Schedule`, from its first iteration or from where a run was left.
@@ -113,8 +119,9 @@ class Trainer:
         episodes: collects the episodes of one iteration after another; closed at the end.
         learner: does the updates.
         guard: looks for NaN and infinity.
-        validate: returns one row an episode on validation maps; closed at the end.
+        validate: measures snapshots of the averaged actor on validation maps; closed at the end.
         validate_every: iterations between validations.
+        pending: the snapshot whose validation was under way when the run was left; None: there was none.
         checkpoints: where everything is saved.
         checkpoint_every: iterations between checkpoints.
         log: where everything is written.
@@ -133,6 +140,7 @@ class Trainer:
         guard: FiniteGuard,
         validate: Validation,
         validate_every: int,
+        pending: Snapshot | None,
         checkpoints: Checkpoints,
         checkpoint_every: int,
         log: RunLog,
@@ -147,6 +155,7 @@ class Trainer:
         self.guard = guard
         self.validate = validate
         self.validate_every = validate_every
+        self.pending = pending
         self.checkpoints = checkpoints
         self.checkpoint_every = checkpoint_every
         self.log = log
@@ -187,14 +196,20 @@ class Trainer:
         if self.checkpoints.saved_iterations is None:
             self._save()  # so that whatever is in the folder later can be told from what was never saved
         started = time.monotonic() - self.progress.elapsed_s
+        if self.pending is not None:
+            self._begin_validation(self.pending)
         with tqdm(total=total, initial=self.progress.iterations, unit="it", disable=None, smoothing=0.1) as bar:
             for iteration in range(self.progress.iterations, total):
                 record = self._iterate(iteration)
+                self.progress = replace(self.progress, iterations=iteration + 1)
+                self._validate()
                 record["time/elapsed_s"] = time.monotonic() - started
-                self.progress = replace(self.progress, iterations=iteration + 1, elapsed_s=record["time/elapsed_s"])
+                self.progress = replace(self.progress, elapsed_s=record["time/elapsed_s"])
                 self.log.scalars(record, self.progress.steps)
                 self.log.progress(iteration, total, self.progress.updates, record, bar)
-                if self._is_due(iteration, self.checkpoint_every) or self.progress.best_iterations == iteration + 1:
+                # A validation that is under way can be begun again from the checkpoint of its agent alone.
+                needed = (self.progress.best_iterations, self.progress.validating_iterations)
+                if self._is_due(iteration, self.checkpoint_every) or iteration + 1 in needed:
                     self._save()
 
     def _iterate(self, iteration: int) -> dict[str, float]:
@@ -223,8 +238,6 @@ class Trainer:
             "time/steps_per_s": batch.numel() / (t1 - t0),
             "time/updates_per_s": number / max(t3 - t2, 1e-9),
         }
-        if self._is_due(iteration, self.validate_every):
-            record |= self._validate(iteration)
         return record
 
     def _collect(self, iteration: int) -> TensorDictBase:
@@ -277,31 +290,49 @@ class Trainer:
         self.log.episodes("training", rows)
         return record
 
-    def _validation_rows(self, iteration: int) -> pd.DataFrame:
-        """Validate, from the beginning if workers fail: its maps stay the same."""
+    def _validate(self) -> None:
+        """Where validation is due, take in what the one before has found, and begin it beside what follows.
+
+        What it finds changes nothing in what is learnt, and is taken in at a point that does not depend on when it
+        was found: a run ends the same with any number of processes.
+        """
+        if not self._is_due(self.progress.iterations - 1, self.validate_every):
+            self._surviving(self.validate.look)
+            return
+        self._take_in_validation()
+        self._begin_validation(Snapshot(self.progress, self.learner.averaged_actor()))
+
+    def _begin_validation(self, snapshot: Snapshot) -> None:
+        at_end = self.progress.iterations == self.schedule.iterations
+        self.validate.start(snapshot, alone=at_end)
+        self.progress = replace(self.progress, validating_iterations=snapshot.progress.iterations)
+        if at_end or not self.validate.beside:
+            self._take_in_validation()
+
+    def _take_in_validation(self) -> None:
+        """Wait for the validation that is under way, if one is, and log it as of the agent it has looked at."""
+        if (snapshot := self.validate.snapshot) is None:
+            return
+        rows = self._surviving(self.validate.finish)
+        then = snapshot.progress
+        rows.insert(0, "iteration", then.iterations - 1)
+        rows.insert(1, "updates", then.updates)
+        self.log.episodes("validation", rows)
+        means, scalars = scores(rows, self.validate.steps)
+        self.log.validation(then.iterations, means)
+        self.log.scalars(scalars, then.steps)
+        score, best = scalars["validation/score"], self.progress.best_score
+        if best is None or score > best:
+            self.progress = replace(self.progress, best_score=score, best_iterations=then.iterations)
+        self.progress = replace(self.progress, validating_iterations=None)
+
+    def _surviving(self, receive: Callable[[], T]) -> T:
+        """Receive from the validation, which begins anew if its processes fail: its maps stay the same."""
         while True:
             try:
-                return self.validate()
+                return receive()
             except WorkerError as error:
-                self._restart(f"iteration {iteration}, validation", error)
-
-    def _validate(self, iteration: int) -> dict[str, float]:
-        rows = self._validation_rows(iteration)
-        rows.insert(0, "iteration", iteration)
-        rows.insert(1, "updates", self.progress.updates)
-        self.log.episodes("validation", rows)
-        conditions = ["beta", "collision_weight"]
-        by_condition = rows.groupby(conditions, dropna=False)[list(METRICS)].mean()
-        self.log.validation(by_condition.reset_index())
-        score = validation_score(by_condition, self.validate.steps)
-        best = self.progress.best_score
-        if best is None or score > best:
-            self.progress = replace(self.progress, best_score=score, best_iterations=iteration + 1)
-        record = {"validation/score": score}
-        for values in by_condition.reset_index().to_dict("records"):
-            label = next((f"{values[key]:g}" for key in conditions if not math.isnan(values[key])), "all")
-            record |= {f"validation/{metric}/{label}": float(values[metric]) for metric in METRICS}
-        return record
+                self._restart(f"validation after {self.progress.validating_iterations} iterations", error)
 
     def _save(self) -> None:
         self.checkpoints.save(self.progress, self.log.lengths())

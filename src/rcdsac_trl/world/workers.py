@@ -93,7 +93,7 @@ class Workers(ParallelEnv):
     def _check(self, missing: Sequence[int], waited_s: float) -> None:
         for number in missing:
             if not self._workers[number].is_alive() and not self._shm_done_flags[number]:
-                self._fail(number, _ending(self._workers[number].exitcode))
+                self._fail(number, ending(self._workers[number].exitcode))
         if self._limit_s is not None and waited_s > self._limit_s:
             self._fail(missing[0], f"gave no answer within {self._limit_s:g} s")
 
@@ -112,7 +112,7 @@ class Workers(ParallelEnv):
     def _check_all(self, cause: BaseException | None = None) -> None:
         for number, worker in enumerate(self._workers):
             if not worker.is_alive():
-                self._fail(number, _ending(worker.exitcode), cause)
+                self._fail(number, ending(worker.exitcode), cause)
 
     @contextlib.contextmanager
     def _killing_those_that_never_start(self) -> Iterator[None]:
@@ -155,7 +155,8 @@ class Workers(ParallelEnv):
         torch.set_num_threads(threads)
 
 
-def _ending(code: int | None) -> str:
+def ending(code: int | None) -> str:
+    """Say how a process ended that has an exit code."""
     if code is not None and code < 0:
         return f"was killed by {signal.Signals(-code).name}"
     return f"ended with exit code {code}"

@@ -1,32 +1,27 @@
 """An evaluation from its config."""
 
-import contextlib
 import sys
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-import safetensors.torch
-import torch
 from omegaconf import DictConfig
-from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import logs, runtime
-from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_policy
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss
+from rcdsac_trl.pipeline.build.driver import Course, driver
 from rcdsac_trl.pipeline.build.read import evaluation_settings, settings_of_run, training_settings
-from rcdsac_trl.pipeline.build.world import evaluation_environment
 from rcdsac_trl.pipeline.checkpoint import load_weights
 from rcdsac_trl.pipeline.cli import compose
-from rcdsac_trl.pipeline.drivers import Drive, Rows, drive_maps, resolve_processes
-from rcdsac_trl.pipeline.evaluation import EvaluationRun, measure_map
+from rcdsac_trl.pipeline.drivers import Rows, drive_maps, resolve_processes
+from rcdsac_trl.pipeline.evaluation import EvaluationRun
 from rcdsac_trl.pipeline.metrics import Condition
-from rcdsac_trl.pipeline.policies import PursuitPolicy
 from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, find
 from rcdsac_trl.pipeline.settings import WorldSettings
-from rcdsac_trl.seeding import torch_seed
+from rcdsac_trl.pipeline.validation import packed
 
 
 def evaluation(cfg: DictConfig) -> EvaluationRun:
@@ -57,8 +52,19 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
             for damaged in load_weights(checkpoints, settings.checkpoint, average=average):
                 print(f"rcdsac_trl: {damaged}", file=sys.stderr)
             # Read once: a training that goes on may write another checkpoint meanwhile.
-            weights = safetensors.torch.save(average.module.state_dict())
-        make = partial(_driver, settings, trained, world, conditions, device, weights)
+            weights = packed(average.module)
+        course = Course(
+            trained=trained,
+            world=world,
+            conditions=conditions,
+            split=settings.split,
+            seed=settings.seed,
+            num_episodes=settings.num_episodes,
+            sampled=settings.sampled,
+            device=device,
+            threads=1 if settings.threads == "auto" else settings.threads,
+        )
+        make = partial(driver, course, weights)
         processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
         return drive_maps(make, settings.num_maps, processes)
 
@@ -83,57 +89,6 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         num_maps=settings.num_maps,
         maps=maps,
     )
-
-
-@contextlib.contextmanager
-def _driver(
-    settings: EvaluationSettings,
-    trained: TrainingSettings,
-    world: WorldSettings,
-    conditions: Sequence[Condition],
-    device: str,
-    weights: bytes | None,
-) -> Iterator[Drive]:
-    """Make what drives one map after another, in this process.
-
-    Args:
-        settings: the evaluation's.
-        trained: those of the run's training.
-        world: what is driven in.
-        conditions: what the agents of each block are told.
-        device: where the policy acts.
-        weights: the actor's, packed; None for the baseline.
-    """
-    runtime.set_threads(1 if settings.threads == "auto" else settings.threads)
-    algo = None if weights is None else trained.algo
-    env = evaluation_environment(
-        world, algo, conditions, settings.split, settings.seed, settings.num_episodes, trained.network.memory
-    )
-    noise = torch.Generator(device=device)
-    policy: TensorDictModuleBase = PursuitPolicy()
-    if weights is not None:
-        actor = make_average(make_loss(trained, device), trained.learner).module
-        actor.load_state_dict(safetensors.torch.load(weights))
-        policy = make_policy(actor, noise, device)
-
-    def drive(map_index: int) -> Rows:
-        # By the map's number, so that it does not matter which process drives it.
-        noise.manual_seed(torch_seed(settings.seed, "evaluation actions", map_index))
-        return measure_map(
-            env,
-            policy,
-            conditions=conditions,
-            num_agents=settings.num_episodes,
-            map_index=map_index,
-            steps=world.task.episode_steps,
-            sampled=settings.sampled,
-            episode=map_index,
-        )
-
-    try:
-        yield drive
-    finally:
-        env.close()
 
 
 def _trained(settings: EvaluationSettings) -> TrainingSettings:

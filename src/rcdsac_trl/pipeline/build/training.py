@@ -2,15 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import LossModule, SoftUpdate
 
@@ -24,19 +23,21 @@ from rcdsac_trl.pipeline.build.agent import (
     make_relabel,
     parameters,
 )
+from rcdsac_trl.pipeline.build.driver import Course, driver
 from rcdsac_trl.pipeline.build.read import settings_of_run, training_settings
-from rcdsac_trl.pipeline.build.world import environment, evaluation_environment
-from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators, rotate
+from rcdsac_trl.pipeline.build.world import environment
+from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators, load_average, rotate
 from rcdsac_trl.pipeline.collection import Episodes
+from rcdsac_trl.pipeline.drivers import cores, resolve_processes_beside
 from rcdsac_trl.pipeline.durable import FolderLock
-from rcdsac_trl.pipeline.evaluation import Validation
 from rcdsac_trl.pipeline.guard import FiniteGuard, load_failure
 from rcdsac_trl.pipeline.policies import CollectionPolicy
 from rcdsac_trl.pipeline.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
-from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, Saved, best_damage, newest
+from rcdsac_trl.pipeline.saved import CHECKPOINTS, DamagedError, Progress, Saved, best_damage, folder_name, newest
 from rcdsac_trl.pipeline.trainer import Learner, Trainer
+from rcdsac_trl.pipeline.validation import Snapshot, Validation, packed
 from rcdsac_trl.world.lidar import sensor_mask
 
 # Validation looks at the same maps whatever seed a run is trained with.
@@ -189,15 +190,22 @@ def _assemble(
         keep=settings.checkpoint.keep,
     )
     written = sum(path.stat().st_size for path in (folder / REPLAY).glob("*"))
-    # Those that stay, the best, the one being written; a checkpoint doubles when the optimiser has its state.
-    checkpoints_bytes = 2 * checkpoints.size_bytes() * (settings.checkpoint.keep + 2)
+    # Those that stay, the best, the one being validated, the one being written; a checkpoint doubles when the optimiser
+    # has its state.
+    checkpoints_bytes = 2 * checkpoints.size_bytes() * (settings.checkpoint.keep + 3)
     shortage = resources.disk_shortage(folder, max(0, _replay_bytes(settings) - written) + checkpoints_bytes)
     told = [*told, *([] if shortage is None else [shortage])]
-    progress = Progress()
+    progress, pending = Progress(), None
     if saved is not None:
         progress, more = _restore(folder, checkpoints, saved)
+        pending, progress, left_out = _pending(settings, checkpoints.folder, progress)
         total = settings.schedule.iterations
-        told = [*told, *more, f"continue after {progress.iterations} of {total} iterations, from {saved.path}"]
+        told = [
+            *told,
+            *more,
+            *left_out,
+            f"continue after {progress.iterations} of {total} iterations, from {saved.path}",
+        ]
     log = logs.RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
     for sentence in [*told, f"device {device}, {threads} threads, allocator: {runtime.allocator()}"]:
         log.message(sentence)
@@ -207,8 +215,9 @@ def _assemble(
         episodes=_episodes(settings, loss, device, progress),
         learner=learner,
         guard=FiniteGuard(folder, loss, optimizer),
-        validate=_validation(settings, average.module, device),
+        validate=_validation(settings, device, threads),
         validate_every=settings.validation.every_iterations,
+        pending=pending,
         checkpoints=checkpoints,
         checkpoint_every=settings.checkpoint.every_iterations,
         log=log,
@@ -265,21 +274,42 @@ def _episodes(settings: TrainingSettings, loss: LossModule, device: str, progres
     return Episodes(collector, policy.set_iteration, iteration=done, map_index=done + progress.skipped_maps)
 
 
-def _validation(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> Validation:
-    algo, world = settings.algo, settings.training_world
-    conditions = algo.default_conditions
+def _pending(
+    settings: TrainingSettings, checkpoints: Path, progress: Progress
+) -> tuple[Snapshot | None, Progress, list[str]]:
+    """Load the agent whose validation was under way; without it that validation is left out, and the user told."""
+    if progress.validating_iterations is None:
+        return None, progress, []
+    path = checkpoints / folder_name(progress.validating_iterations)
+    average = make_average(make_loss(settings, "cpu"), settings.learner)
+    try:
+        then = load_average(path, average).progress
+    except DamagedError as error:
+        told = f"checkpoint {path} is damaged: {error}; its validation was under way and is left out"
+        return None, replace(progress, validating_iterations=None), [told]
+    return Snapshot(then, packed(average.module)), progress, []
 
-    def make_env() -> EnvBase:
-        return evaluation_environment(
-            world, algo, conditions, "validation", VALIDATION_SEED, world.num_agents, settings.network.memory
-        )
 
-    return Validation(
-        make_env,
-        make_policy(actor, torch.Generator(device=device), device),
-        conditions=conditions,
-        num_agents=world.num_agents,
-        num_maps=settings.validation.num_maps,
-        steps=world.task.episode_steps,
+def _validation(settings: TrainingSettings, device: str, threads: int) -> Validation:
+    world, given = replace(settings.training_world, num_workers=0), settings.validation
+    course = Course(
+        trained=settings,
+        world=world,
+        conditions=settings.algo.default_conditions,
+        split="validation",
         seed=VALIDATION_SEED,
+        num_episodes=world.num_agents,
+        sampled=False,
+        device=device,
+        threads=1,
+    )
+    beside = resolve_processes_beside(given.processes, given.num_maps, threads)
+    alone = min(cores(), given.num_maps) if given.processes == "auto" else beside
+    return Validation(
+        partial(driver, course),
+        num_maps=given.num_maps,
+        steps=world.task.episode_steps,
+        processes=beside,
+        processes_alone=alone,
+        timeout_s=world.worker_timeout_s,
     )

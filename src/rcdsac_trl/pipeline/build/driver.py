@@ -1,0 +1,94 @@
+"""What drives whole maps, for an evaluation and for validation, in this process or in one of its own."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import safetensors.torch
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_policy
+from rcdsac_trl.pipeline.build.world import evaluation_environment
+from rcdsac_trl.pipeline.drivers import Drive, Rows
+from rcdsac_trl.pipeline.evaluation import measure_map
+from rcdsac_trl.pipeline.metrics import Condition
+from rcdsac_trl.pipeline.policies import PursuitPolicy
+from rcdsac_trl.pipeline.run_settings import TrainingSettings
+from rcdsac_trl.pipeline.settings import WorldSettings
+from rcdsac_trl.seeding import torch_seed
+from rcdsac_trl.world.maps import Split
+
+
+@dataclass(frozen=True)
+class Course:
+    """What is driven, and how; it pickles.
+
+    Attributes:
+        trained: settings of the run's training.
+        world: what is driven in, without worker processes.
+        conditions: what the agents of each block are told.
+        split: which maps.
+        seed: root seed of the maps, and of the noise of sampled actions.
+        num_episodes: episodes a map and a condition.
+        sampled: draw actions instead of taking tanh(mean).
+        device: where the policy acts.
+        threads: that torch uses for one operation while it drives.
+    """
+
+    trained: TrainingSettings
+    world: WorldSettings
+    conditions: Sequence[Condition]
+    split: Split
+    seed: int
+    num_episodes: int
+    sampled: bool
+    device: str
+    threads: int
+
+
+@contextlib.contextmanager
+def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
+    """Make what drives one map after another, in this process.
+
+    Args:
+        course: what is driven.
+        actor: the actor's weights, packed; None: pursuit drives, which is told nothing.
+    """
+    threads = torch.get_num_threads()
+    runtime.set_threads(course.threads)
+    algo = None if actor is None else course.trained.algo
+    memory = course.trained.network.memory
+    env = evaluation_environment(
+        course.world, algo, course.conditions, course.split, course.seed, course.num_episodes, memory
+    )
+    noise = torch.Generator(device=course.device)
+    policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
+
+    def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
+        # By the map's number, so that it does not matter which process drives it.
+        noise.manual_seed(torch_seed(course.seed, "evaluation actions", map_index))
+        return measure_map(
+            env,
+            policy,
+            conditions=course.conditions,
+            num_agents=course.num_episodes,
+            map_index=map_index,
+            steps=course.world.task.episode_steps,
+            sampled=course.sampled,
+            episode=map_index,
+            before_step=before_step,
+        )
+
+    try:
+        yield drive
+    finally:
+        env.close()
+        torch.set_num_threads(threads)
+
+
+def _policy(course: Course, actor: bytes, noise: torch.Generator) -> TensorDictModuleBase:
+    module = make_average(make_loss(course.trained, course.device), course.trained.learner).module
+    module.load_state_dict(safetensors.torch.load(actor))
+    return make_policy(module, noise, course.device)
