@@ -5,6 +5,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -155,6 +156,15 @@ def test_the_newest_stay_and_the_best(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     assert find(tmp_path, "best")[0].path.name == "iteration-000006"
     assert find(tmp_path, "last")[0].path.name == "iteration-000008"
+
+
+def test_the_one_under_validation_stays_until_a_checkpoint_knows_the_result(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, {"number": Number(0.0)}, replay=None, keep=1)
+    seen = []
+    for iterations, best, validating in [(1, None, 1), (2, None, 1), (3, 1, 3), (4, 1, 3), (5, 1, 5), (6, 5, None)]:
+        checkpoints.save(replace(progress(iterations, best), validating_iterations=validating), {})
+        seen.append(names(tmp_path))
+    assert seen == [[1], [1, 2], [1, 3], [1, 3, 4], [1, 5], [5, 6]]
 
 
 def test_nothing_is_ever_written_over(tmp_path: Path) -> None:

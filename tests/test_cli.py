@@ -111,6 +111,7 @@ def refusal(
         ([POW, "schedule.pursuit_noise=-1"], "schedule.pursuit_noise=-1 is not a number of at least 0"),
         ([POW, "validation.num_maps=0"], "validation.num_maps=0 must be at least 1"),
         ([POW, "validation.every_iterations=0"], "validation.every_iterations=0 must be at least 1"),
+        ([POW, "validation.processes=-1"], "validation.processes=-1 must be at least 0"),
         ([POW, "checkpoint.every_iterations=-5"], "checkpoint.every_iterations=-5 must be at least 1"),
         ([POW, "network.memory=0"], "memory = 0 is below 1"),
         ([POW, "map.size_m=big"], "map.size_m=big must be a number"),
@@ -331,8 +332,13 @@ def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_ctrl_c_with_workers(tmp_path: Path) -> None:
-    code, err = interrupt(tmp_path, "world.num_workers=2")
+@pytest.mark.parametrize(
+    "processes",
+    [["world.num_workers=2"], ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"]],
+    ids=["workers", "validation"],
+)
+def test_ctrl_c_with_processes(tmp_path: Path, processes: list[str]) -> None:
+    code, err = interrupt(tmp_path, *processes)
     assert code == 130
     assert "Traceback" not in err
     assert load_progress(tmp_path / "run" / "checkpoints", "last").updates >= 2

@@ -196,7 +196,7 @@ def test_a_run_that_validates_in_place_is_the_same(server: Server, whole: tuple[
 def under_way(server: Server, whole: tuple[Path, Counted], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that was killed when it had saved three iterations; the agent after two was being validated."""
     run = tmp_path_factory.mktemp("under way") / "run"
-    events, step = whole[1]["training"], 1
+    events, step = whole[1]["training"], 13  # in the fourth of five iterations
     while not (run / "checkpoints" / "iteration-000003").exists():
         shutil.rmtree(run, ignore_errors=True)
         assert server.call("train", run, kill_at=("training", events * step // 20)) is None
