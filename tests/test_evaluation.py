@@ -309,13 +309,13 @@ def test_a_run_meets_the_same_episodes_as_the_baseline(run: Path) -> None:
 def test_actions_are_tanh_of_the_mean(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[TensorDictBase] = []
 
-    def watched(env: EnvBase, policy: TensorDictModuleBase, steps: int, episode: int | None) -> TensorDictBase:
+    def watched(env: EnvBase, policy: TensorDictModuleBase, *given: Any) -> TensorDictBase:
         def drive(tensordict: TensorDictBase) -> TensorDictBase:
             out = policy(tensordict)
             seen.append(out.select("loc", "scale", "action").clone())
             return out
 
-        return run_episodes(env, drive, steps, episode)  # type: ignore[arg-type]
+        return run_episodes(env, drive, *given)  # type: ignore[arg-type]
 
     monkeypatch.setattr(evaluation, "run_episodes", watched)
     evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'a'}")

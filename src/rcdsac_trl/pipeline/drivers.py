@@ -105,6 +105,9 @@ class Drivers:
         timeout_s: seconds without a step after which a process counts as hung, while one waits for it; None: never.
         at_once: give out all maps now, for one who does not come back for long; else a process that is done gets the
             next one, which shares them better.
+
+    Raises:
+        WorkerError: if a process cannot be started.
     """
 
     def __init__(
@@ -133,8 +136,11 @@ class Drivers:
             for _ in range(num_maps if at_once else 1):
                 for connection in self._drivers:
                     self._give(connection)
-        except BaseException:
+        except BaseException as error:
+            number = len(self._drivers) + 1
             self.close()
+            if isinstance(error, EOFError | ConnectionError):  # the process that they are forked from is gone
+                raise WorkerError(f"driving process {number} of {processes} did not start") from error
             raise
 
     def _give(self, connection: Connection) -> None:

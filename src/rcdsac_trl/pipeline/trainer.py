@@ -304,8 +304,8 @@ class Trainer:
 
     def _begin_validation(self, snapshot: Snapshot) -> None:
         at_end = self.progress.iterations == self.schedule.iterations
-        self.validate.start(snapshot, alone=at_end)
         self.progress = replace(self.progress, validating_iterations=snapshot.progress.iterations)
+        self._surviving(lambda: self.validate.start(snapshot, alone=at_end))
         if at_end or not self.validate.beside:
             self._take_in_validation()
 
@@ -326,11 +326,11 @@ class Trainer:
             self.progress = replace(self.progress, best_score=score, best_iterations=then.iterations)
         self.progress = replace(self.progress, validating_iterations=None)
 
-    def _surviving(self, receive: Callable[[], T]) -> T:
-        """Receive from the validation, which begins anew if its processes fail: its maps stay the same."""
+    def _surviving(self, call: Callable[[], T]) -> T:
+        """Ask something of the validation, which begins anew if its processes fail: its maps stay the same."""
         while True:
             try:
-                return receive()
+                return call()
             except WorkerError as error:
                 self._restart(f"validation after {self.progress.validating_iterations} iterations", error)
 

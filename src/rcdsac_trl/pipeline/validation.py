@@ -87,6 +87,9 @@ class Validation:
         Args:
             snapshot: what to measure.
             alone: training waits for it.
+
+        Raises:
+            WorkerError: if a process cannot be started.
         """
         self.snapshot = snapshot
         self._alone = alone
