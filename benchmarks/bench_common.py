@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.pipeline.build import training
 from rcdsac_trl.pipeline.build.read import training_settings
 from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.trainer import Learner
 from rcdsac_trl.seeding import torch_stream
-from rcdsac_trl.world.lidar import sensor_mask
 
 EPISODES = 20
 

@@ -14,9 +14,9 @@ import bench_world as bench
 
 def _make_naive() -> None:
     """Make every simulation of this process a naive one."""
+    from rcdsac_trl.interface import MAX_RANGE_M, NUM_BINS
     from rcdsac_trl.world import simulation
     from rcdsac_trl.world.bullet import pybullet
-    from rcdsac_trl.world.lidar import MAX_RANGE_M, NUM_BINS
 
     simulation.SHAPES_PER_BODY = 1
 

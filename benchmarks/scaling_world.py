@@ -69,8 +69,8 @@ def replay_bytes(steps: int) -> int:
     import torch
     from tensordict import TensorDict
 
+    from rcdsac_trl.interface import sensor_mask
     from rcdsac_trl.pipeline.replay import SequenceReplay
-    from rcdsac_trl.world.lidar import sensor_mask
     from rcdsac_trl.world.spaces import SPACES
 
     episode_steps = 1000

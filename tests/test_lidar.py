@@ -8,8 +8,9 @@ import pybullet
 import pytest
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.interface import MAX_RANGE_M, NUM_BINS, SENSORS, sensor_mask
 from rcdsac_trl.seeding import stream
-from rcdsac_trl.world.lidar import MAX_RANGE_M, NUM_BINS, SENSORS, sector_distances, sensor_mask
+from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import MapSettings, generate_map
 from rcdsac_trl.world.planner import Planner
 from rcdsac_trl.world.simulation import Simulation

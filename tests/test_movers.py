@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import Map, MapSettings, Mover, generate_map
 from rcdsac_trl.world.movers import CORNER_CUT_M, PATIENCE_S, START_GAP_M, STOP_GAP_M, Movers, make_tour
 from rcdsac_trl.world.planner import Planner
-from rcdsac_trl.world.task import MOTOR_PERIOD_S
 
 
 def walk(movers, seconds, robot=(1e3, 1e3)):

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from rcdsac_trl.interface import desired_velocities
 from rcdsac_trl.world.env import NavigationEnv
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.pursuit import pursuit_action
-from rcdsac_trl.world.task import desired_velocities
 
 
 def seen(bearing_deg: float) -> torch.Tensor:

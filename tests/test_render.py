@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.world import render
 from rcdsac_trl.world.env import NavigationEnv
-from rcdsac_trl.world.lidar import sector_distances, sensor_mask
+from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import Box, Cylinder, Map, MapSettings
 from rcdsac_trl.world.render import Renderer, Scene
 

@@ -8,6 +8,7 @@ import numpy as np
 import pybullet
 import pytest
 
+from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world import simulation as world_simulation
 from rcdsac_trl.world.lidar import sector_distances
@@ -15,7 +16,6 @@ from rcdsac_trl.world.maps import Box, Cylinder, Map, MapSettings, Mover, genera
 from rcdsac_trl.world.movers import STOP_GAP_M
 from rcdsac_trl.world.planner import Planner
 from rcdsac_trl.world.simulation import Simulation
-from rcdsac_trl.world.task import MOTOR_PERIOD_S
 
 APOTHEM_M = 0.25 * math.cos(math.pi / 8.0)
 

@@ -6,21 +6,24 @@ import numpy as np
 import pytest
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.seeding import stream
-from rcdsac_trl.world.lidar import NUM_BINS, sensor_mask
-from rcdsac_trl.world.task import (
+from rcdsac_trl.interface import (
     MAX_RANGE_OBSERVATION,
-    TaskSettings,
+    NUM_BINS,
     clip_command,
-    collision_due,
     desired_velocities,
     distance_and_bearing,
+    range_observation,
+    sensor_mask,
+    waypoint_observation,
+)
+from rcdsac_trl.seeding import stream
+from rcdsac_trl.world.task import (
+    TaskSettings,
+    collision_due,
     noisy_ranges,
     noisy_velocities,
-    range_observation,
     reward_components,
     total_reward,
-    waypoint_observation,
 )
 
 

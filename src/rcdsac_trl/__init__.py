@@ -1,8 +1,8 @@
 """Risk-conditioned distributional soft actor-critic for risk-sensitive navigation, on TorchRL.
 
-Three rooms: :mod:`rcdsac_trl.world` is what exists, :mod:`rcdsac_trl.agent` is what learns, and
-:mod:`rcdsac_trl.pipeline` is what happens. World and agent do not know each other: they meet in these keys, each with
-the shape of one agent's entry.
+Four rooms: :mod:`rcdsac_trl.world` is what exists, :mod:`rcdsac_trl.agent` is what learns,
+:mod:`rcdsac_trl.pipeline` is what happens, and :mod:`rcdsac_trl.deploy` is what leaves, onto a robot. World and
+agent do not know each other: they meet in these keys, each with the shape of one agent's entry.
 
 | key | shape, type | unit, values | written by | read by |
 |---|---|---|---|---|
@@ -22,6 +22,34 @@ the shape of one agent's entry.
 | `is_init` | 1 bool | true at the first step | InitTracker | actor |
 | `recurrent_state` | 128 f32 | zero at reset, not in the replay | actor | actor |
 """
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rcdsac_trl.deploy import Policy
+
+
+def load(name_or_folder: str | Path, **options: Any) -> "Policy":
+    """Return a trained agent that drives a robot.
+
+    Args:
+        name_or_folder: an agent that comes with the package, a folder that ``python -m rcdsac_trl.export`` wrote, or
+            a run folder, whose best checkpoint it is then. Only the last needs TorchRL, and takes seconds to import.
+        options: keywords of :class:`rcdsac_trl.deploy.Policy`.
+
+    Raises:
+        rcdsac_trl.errors.UserInputError: if there is no such agent, or it cannot be read.
+    """
+    # Imported late, so that importing the package stays instant.
+    from rcdsac_trl.deploy import Policy, find_weights, read_weights
+
+    folder = Path(name_or_folder)
+    if (folder / "checkpoints").is_dir():
+        from rcdsac_trl.pipeline.build.weights import weights_of_run
+
+        return Policy(weights_of_run(folder, "best"), **options)
+    return Policy(read_weights(find_weights(name_or_folder)), **options)
 
 
 def register_gym() -> None:

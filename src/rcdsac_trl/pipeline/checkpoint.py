@@ -174,6 +174,34 @@ def load_average(path: Path, average: AveragedModel) -> Saved:
     return saved
 
 
+class _State:
+    """Takes a component's state as it was saved."""
+
+    def __init__(self) -> None:
+        self.state: Mapping[str, torch.Tensor] = {}
+
+    def state_dict(self) -> Mapping[str, torch.Tensor]:
+        return self.state
+
+    def load_state_dict(self, state: Mapping[str, torch.Tensor]) -> None:
+        self.state = state
+
+
+def load_states(folder: Path, name: Name) -> tuple[Saved, dict[str, Mapping[str, torch.Tensor]], list[str]]:
+    """Load the tensors of a checkpoint's loss and averaged actor by name, without making either.
+
+    Returns:
+        The checkpoint, the states of ``loss`` and ``average``, and what :func:`load_weights` returns.
+
+    Raises:
+        UserInputError: as :func:`find`.
+    """
+    saved, damaged = find(folder, name)
+    states = {"loss": _State(), "average": _State()}
+    _load(Checkpoint(**states), saved.path)
+    return saved, {key: component.state for key, component in states.items()}, damaged
+
+
 def _tensor_bytes(state: Any) -> int:
     if isinstance(state, torch.Tensor):
         return state.nbytes

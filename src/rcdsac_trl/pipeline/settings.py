@@ -6,9 +6,9 @@ from typing import Literal, get_args
 
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.interface import SENSORS
 from rcdsac_trl.pipeline.metrics import Condition, check_unique
 from rcdsac_trl.world.env import resolve_num_workers
-from rcdsac_trl.world.lidar import SENSORS
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.task import TaskSettings
 

@@ -9,10 +9,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl import interface
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.world import task as rules
 from rcdsac_trl.world.episode import NavigationAgent
-from rcdsac_trl.world.lidar import sensor_mask
 from rcdsac_trl.world.maps import SPLITS, MapSettings, Split
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.spaces import ACTION_SIZE, SPACES, Buffers
@@ -28,7 +29,7 @@ class AgentGroup:
     Args:
         map_settings: how maps are generated.
         task: rules of the task.
-        sensor: one of :data:`rcdsac_trl.world.lidar.SENSORS`.
+        sensor: one of :data:`rcdsac_trl.interface.SENSORS`.
         split: which of the disjoint map sets.
         seed: root seed, at least 0.
         agent_ids: the agents' global numbers, at least 0; agents with equal numbers meet the same episodes.
@@ -139,11 +140,11 @@ class AgentGroup:
         buffers, agents = self.buffers, [self._agents[row] for row in rows]
         at = slice(None) if len(rows) == len(self) else rows
         distances = np.array([agent.distances_m for agent in agents])
-        buffers.range[at] = rules.range_observation(distances, self._mask)
+        buffers.range[at] = interface.range_observation(distances, self._mask)
         numbers = np.array(
             [
                 (
-                    *rules.waypoint_observation(agent.pose, *agent.next_waypoints),
+                    *interface.waypoint_observation(agent.pose, *agent.next_waypoints),
                     *agent.velocities,
                     *agent.pose,
                     *agent.reward_components,

@@ -13,7 +13,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl import interface
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.interface import Point
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world import task as rules
 from rcdsac_trl.world.maps import MapSettings, Split, generate_map
@@ -21,7 +23,7 @@ from rcdsac_trl.world.planner import Planner
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.shapes import Map
 from rcdsac_trl.world.simulation import Simulation
-from rcdsac_trl.world.task import Point, TaskSettings
+from rcdsac_trl.world.task import TaskSettings
 
 Pose = tuple[float, float, float]
 
@@ -117,14 +119,14 @@ class NavigationAgent:
     def step(self, action: Sequence[float]) -> None:
         """Take one agent step."""
         simulation, task = self._require_simulation(), self._task
-        v_u, omega_u = rules.desired_velocities(action)
+        v_u, omega_u = interface.desired_velocities(action)
         self._delayed.append((v_u, omega_u))
         moved = simulation.step(*self._delayed.popleft(), self._motor_steps)
         collided = rules.collision_due(moved.in_contact, self.in_contact, task.collision_penalty_mode)
         self.in_contact = moved.in_contact
         self.pose = moved.pose
         # The step is paid for progress to the waypoint that was next while it was taken.
-        _, bearing = rules.distance_and_bearing(self.pose, self._path[self._next])
+        _, bearing = interface.distance_and_bearing(self.pose, self._path[self._next])
         self.goal_reached = self._distance_to(self._goal) < task.goal_radius_m
         self.reward_components = rules.reward_components(
             moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached

@@ -8,7 +8,7 @@ import math
 
 import torch
 
-from rcdsac_trl.world.task import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
+from rcdsac_trl.interface import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
 
 # Turning rate per bearing error, 1/s. A robot that turns at full rate needs 34 degrees to stop turning, and
 # this gain asks for less than the full rate from 60 degrees on, so the heading does not overshoot.

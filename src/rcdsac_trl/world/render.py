@@ -13,8 +13,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.interface import MAX_RANGE_M
 from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
-from rcdsac_trl.world.lidar import MAX_RANGE_M
 from rcdsac_trl.world.shapes import Map
 
 Color = tuple[int, ...]

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.interface import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S, clip_command
 from rcdsac_trl.world.bullet import pybullet
 from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.lidar import scan
 from rcdsac_trl.world.maps import Box, Cylinder, Map
 from rcdsac_trl.world.movers import Movers, WalkPlanner
-from rcdsac_trl.world.task import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S, clip_command
 
 CONTACT_DISTANCE_M = 1e-3
 """The robot is in contact with what is nearer than this.

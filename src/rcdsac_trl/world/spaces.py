@@ -10,8 +10,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.world import task
-from rcdsac_trl.world.lidar import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl import interface
+from rcdsac_trl.interface import MAX_RANGE_M, NUM_BINS
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def _unlimited(size: int) -> Space:
 _FLAG = Space(np.zeros(1, np.float32), np.ones(1, np.float32), np.bool_)
 # Velocities are measured after contacts, in which a mover can push; 10 m/s and 10 rad/s are far beyond that.
 _FASTEST = 10.0
-_LOG_NEAR, _LOG_FAR = (math.log10(limit) for limit in task.WAYPOINT_DISTANCE_LIMITS_M)
+_LOG_NEAR, _LOG_FAR = (math.log10(limit) for limit in interface.WAYPOINT_DISTANCE_LIMITS_M)
 
 ACTION_SIZE = 2
 NUM_REWARD_COMPONENTS = 5
@@ -58,7 +58,7 @@ AGENT_OBSERVATIONS = ("range", "waypoint", "velocity")
 """What a policy may see; the other keys are for metrics and drawing."""
 
 SPACES: dict[str, Space] = {
-    "range": _numbers([0.0] * NUM_BINS, [task.RANGE_OFFSET + math.log10(MAX_RANGE_M)] * NUM_BINS),
+    "range": _numbers([0.0] * NUM_BINS, [interface.RANGE_OFFSET + math.log10(MAX_RANGE_M)] * NUM_BINS),
     "waypoint": _numbers([_LOG_NEAR, -1.0, -1.0] * 2, [_LOG_FAR, 1.0, 1.0] * 2),
     "velocity": _numbers([-_FASTEST] * 4, [_FASTEST] * 4),
     "pose": _unlimited(3),

@@ -1,7 +1,7 @@
-"""The task: what the robot is told, what its actions mean and what it is paid, as pure functions.
+"""The task: its settings, what the robot is paid, and the noise of its sensors, as pure functions.
 
-Everything here follows the paper's sections "States and Observations", "Actions" and "Reward"; nothing here
-holds state. Whoever steps the world calls these functions and keeps the state.
+Everything here follows the paper's section "Reward"; nothing here holds state. Whoever steps the world calls these
+functions and keeps the state. What the robot is told and what its actions mean is :mod:`rcdsac_trl.interface`.
 """
 
 import math
@@ -13,32 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.world.lidar import MAX_RANGE_M
-
-# Actions (paper, section "Actions").
-MIN_LINEAR_VELOCITY = -0.2
-"""w_minv, m/s."""
-MAX_LINEAR_VELOCITY = 0.6
-"""w_maxv, m/s."""
-MAX_ANGULAR_VELOCITY = math.radians(90.0)
-"""w_maxomega, rad/s."""
-DEAD_BAND = math.radians(15.0)
-"""Desired angular velocities below this are taken as 0, rad/s."""
-MAX_LINEAR_ACCELERATION = 1.5
-"""w_accv, m/s^2."""
-MAX_ANGULAR_ACCELERATION = math.radians(120.0)
-"""w_accomega, rad/s^2."""
-MOTOR_PERIOD_S = 0.02
-"""Control period of the motor controller, Delta t."""
-
-# Observations (paper, section "States and Observations").
-MIN_RANGE_M = 0.01
-"""Ranges are seen strictly between this and the lidar's :data:`~rcdsac_trl.world.lidar.MAX_RANGE_M`."""
-RANGE_OFFSET = 2.5
-"""What is added to log10 of the distance, so that 0 can mean "nothing there"."""
-MAX_RANGE_OBSERVATION = RANGE_OFFSET + math.log10(MAX_RANGE_M)
-"""Upper limit of a range observation."""
-WAYPOINT_DISTANCE_LIMITS_M = (0.01, 100.0)
+from rcdsac_trl.interface import inside_dead_band
 
 # Reward (paper, section "Reward").
 BASE_REWARD = -0.02
@@ -50,12 +25,6 @@ STRAIGHT_FACTOR = 1.2
 MIN_TURN_FACTOR = 0.5
 TURN_SCALE = math.radians(120.0)
 """The desired angular velocity at which 1 - |omega_u| / scale would reach 0, rad/s."""
-
-# A bound given in degrees must hold for a float that went through radians: 15 deg/s itself is kept.
-_ANGULAR_TOLERANCE = 1e-6
-
-Point = tuple[float, float]
-"""x and y in the map frame, m."""
 
 CollisionPenaltyMode = Literal["onset", "per_step"]
 """When r_coll is paid: once as a contact begins, or in every agent step in contact."""
@@ -131,120 +100,6 @@ class TaskSettings:
             raise UserInputError(f"action_delay_steps={self.action_delay_steps} must be 0 or more")
 
 
-def desired_velocities(action: Sequence[float] | NDArray) -> tuple[float, float]:
-    """Return the desired velocities (v_u, omega_u) of an action, m/s and rad/s.
-
-    The linear velocity runs from -0.2 to 0.6 m/s over u_0; the angular one is 90 deg/s times u_1, and 0 where
-    its size is below 15 deg/s.
-
-    Args:
-        action: u, [2], in [-1, 1]; what is outside is clipped.
-
-    Example:
-        >>> desired_velocities([1.0, 0.1])
-        (0.6, 0.0)
-    """
-    u0, u1 = float(action[0]), float(action[1])
-    u0 = 1.0 if u0 > 1.0 else -1.0 if u0 < -1.0 else u0
-    u1 = 1.0 if u1 > 1.0 else -1.0 if u1 < -1.0 else u1
-    linear = MIN_LINEAR_VELOCITY * (1.0 - u0) / 2.0 + MAX_LINEAR_VELOCITY * (1.0 + u0) / 2.0
-    angular = MAX_ANGULAR_VELOCITY * u1
-    return linear, 0.0 if _inside_dead_band(angular) else angular
-
-
-def _inside_dead_band(angular_velocity: float) -> bool:
-    """Return whether |omega| < 15 deg/s; exactly 15 deg/s is outside, float rounding or not."""
-    return abs(angular_velocity) < DEAD_BAND * (1.0 - _ANGULAR_TOLERANCE)
-
-
-def clip_command(
-    v_u: float, omega_u: float, v_c: float, omega_c: float, period_s: float = MOTOR_PERIOD_S
-) -> tuple[float, float]:
-    """Return the velocities the motor controller commands: the desired ones, within the acceleration limits.
-
-    Args:
-        v_u: desired linear velocity, m/s.
-        omega_u: desired angular velocity, rad/s.
-        v_c: current linear velocity, m/s.
-        omega_c: current angular velocity, rad/s.
-        period_s: control period of the motor controller.
-
-    Example:
-        >>> clip_command(0.6, 0.0, 0.0, 0.0)
-        (0.03, 0.0)
-    """
-    dv, domega = MAX_LINEAR_ACCELERATION * period_s, MAX_ANGULAR_ACCELERATION * period_s
-    # Comparisons cost a third of min and max, and this runs in every motor step.
-    v = v_c + dv if v_u > v_c + dv else v_c - dv if v_u < v_c - dv else v_u
-    omega = (
-        omega_c + domega if omega_u > omega_c + domega else omega_c - domega if omega_u < omega_c - domega else omega_u
-    )
-    return v, omega
-
-
-def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float32]:
-    """Return o_rng: 2.5 + log10 of the distance, 0 where nothing is within (0.01, 3) m or the mask is false.
-
-    Args:
-        distances: [..., 180], m; ``inf`` where nothing is.
-        mask: bool [180], the bins the sensor has; see :func:`rcdsac_trl.world.lidar.sensor_mask`.
-
-    Returns:
-        float32 [..., 180].
-
-    Example:
-        >>> range_observation([1.0, 0.1, 3.0], [True, True, True]).tolist()
-        [2.5, 1.5, 0.0]
-    """
-    d = np.asarray(distances, dtype=np.float64)
-    observed = np.zeros(d.shape, dtype=np.float32)
-    seen = (d > MIN_RANGE_M) & (d < MAX_RANGE_M) & np.asarray(mask, dtype=np.bool_)
-    # Of the logarithms, the expensive part, only those that are seen.
-    observed[seen] = RANGE_OFFSET + np.log10(d[seen])
-    return observed
-
-
-def waypoint_observation(pose: tuple[float, float, float], waypoint_1: Point, waypoint_2: Point) -> tuple[float, ...]:
-    """Return o_waypoint: log10 of the distance, cosine and sine of the bearing, of the next two waypoints.
-
-    Args:
-        pose: the robot's x, y in m and yaw in rad, map frame.
-        waypoint_1: the next waypoint, map frame, m.
-        waypoint_2: the one after it; on the last leg both are the goal.
-
-    Returns:
-        Six numbers; distances are clipped to [0.01, 100] m before the logarithm.
-
-    Example:
-        >>> observed = waypoint_observation((0.0, 0.0, 0.0), (10.0, 0.0), (0.0, 100.0))
-        >>> [round(value, 6) for value in observed]
-        [1.0, 1.0, 0.0, 2.0, 0.0, 1.0]
-    """
-    low, high = WAYPOINT_DISTANCE_LIMITS_M
-    distance_1, bearing_1 = distance_and_bearing(pose, waypoint_1)
-    distance_2, bearing_2 = distance_and_bearing(pose, waypoint_2)
-    return (
-        math.log10(min(max(distance_1, low), high)),
-        math.cos(bearing_1),
-        math.sin(bearing_1),
-        math.log10(min(max(distance_2, low), high)),
-        math.cos(bearing_2),
-        math.sin(bearing_2),
-    )
-
-
-def distance_and_bearing(pose: tuple[float, float, float], point: Point) -> tuple[float, float]:
-    """Return the distance to a point in m and its angle from the robot's x axis in rad, any full turns apart.
-
-    Args:
-        pose: the robot's x, y in m and yaw in rad, map frame.
-        point: map frame, m.
-    """
-    x, y, yaw = pose
-    dx, dy = point[0] - x, point[1] - y
-    return math.hypot(dx, dy), math.atan2(dy, dx) - yaw
-
-
 def reward_components(
     v_c: float, theta_1: float, omega_u: float, in_contact: bool, collided: bool, goal_reached: bool
 ) -> tuple[float, float, float, float, float]:
@@ -264,7 +119,7 @@ def reward_components(
     """
     waypoint = 0.0 if in_contact else max(MIN_WAYPOINT_REWARD, max(0.0, v_c) * math.cos(theta_1))
     turning = max(MIN_TURN_FACTOR, 1.0 - abs(omega_u) / TURN_SCALE)
-    angular = STRAIGHT_FACTOR if _inside_dead_band(omega_u) else turning
+    angular = STRAIGHT_FACTOR if inside_dead_band(omega_u) else turning
     goal = GOAL_REWARD if goal_reached else 0.0
     collision = COLLISION_REWARD if collided else 0.0
     return BASE_REWARD, goal, waypoint, angular, collision

@@ -1,18 +1,25 @@
 """The config as checked settings: the only module that knows how a config is laid out."""
 
 import os
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import choices
 from rcdsac_trl.pipeline.logs import CONFIG_NAME
-from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
+from rcdsac_trl.pipeline.run_settings import EvaluationSettings, SensorSettings, TrainingSettings
+from rcdsac_trl.pipeline.settings import AlgoSettings
 from rcdsac_trl.pipeline.typed import read
+from rcdsac_trl.world.task import TaskSettings
+
+Settings = TypeVar("Settings")
 
 
 def training_settings(cfg: DictConfig) -> TrainingSettings:
@@ -21,7 +28,10 @@ def training_settings(cfg: DictConfig) -> TrainingSettings:
     Raises:
         UserInputError: for whatever it holds that cannot work; without an algorithm, a sentence lists the choices.
     """
-    values = _plain(cfg)
+    return _training_settings(_plain(cfg))
+
+
+def _training_settings(values: dict[str, Any]) -> TrainingSettings:
     if values.get("algo") is None:
         raise UserInputError(f"no algorithm chosen: add +algo=<name>, one of {', '.join(choices('algo'))}")
     return read(TrainingSettings, values)
@@ -36,6 +46,26 @@ def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
     return read(EvaluationSettings, _plain(cfg))
 
 
+@dataclass(frozen=True)
+class AgentOfRun:
+    """The sections of a run's config that say what its agent is, and nothing of how it was trained."""
+
+    algo: AlgoSettings
+    sensor: SensorSettings
+    network: Widths
+    task: TaskSettings
+
+
+def agent_of_run(folder: Path) -> AgentOfRun:
+    """Read what a run's agent is; runs whose training other versions would not continue can be read, too.
+
+    Raises:
+        UserInputError: as :func:`settings_of_run`.
+    """
+    names = ("algo", "sensor", "network", "task")
+    return _of_run(folder, "run", lambda values: read(AgentOfRun, {n: values[n] for n in names if n in values}))
+
+
 def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
     """Read what a run was trained with.
 
@@ -46,6 +76,10 @@ def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
     Raises:
         UserInputError: if the folder holds no run, or one that this version cannot read.
     """
+    return _of_run(folder, key, _training_settings)
+
+
+def _of_run(folder: Path, key: str, reader: Callable[[dict[str, Any]], Settings]) -> Settings:
     path = folder / CONFIG_NAME
     if not os.path.isfile(path):  # false for a name that is too long, too
         raise UserInputError(f"{key}={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
@@ -53,7 +87,7 @@ def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
         cfg = OmegaConf.load(path)
         if not isinstance(cfg, DictConfig):
             raise UserInputError("it holds no keys")
-        return training_settings(cfg)
+        return reader(_plain(cfg))
     except (OSError, ValueError, TypeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())
         raise UserInputError(f"{path} cannot be read ({reason}): name a folder that this version wrote") from error

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.agent.targets import FusedSoftUpdate
+from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.pipeline import logs, resources, runtime
 from rcdsac_trl.pipeline.build.agent import (
     make_average,
@@ -38,7 +39,6 @@ from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, DamagedError, Progress, Saved, best_damage, folder_name, newest
 from rcdsac_trl.pipeline.trainer import Learner, Trainer
 from rcdsac_trl.pipeline.validation import Snapshot, Validation, packed
-from rcdsac_trl.world.lidar import sensor_mask
 
 # Validation looks at the same maps whatever seed a run is trained with.
 VALIDATION_SEED = 0
