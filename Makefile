@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Programs of benchmarks/, in the order they run.
-BENCHMARKS := learner collection evaluation whole_job scaling_learner scaling_world
+BENCHMARKS := deploy learner collection evaluation whole_job scaling_learner scaling_world
 
 .PHONY: setup train smoke test test-slow check format bench clean
 

@@ -123,9 +123,9 @@ print(sorted(heavy & {{name.split(".")[0] for name in sys.modules}}))
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
-def untrained_run(folder: Path, row: str) -> tuple[Path, LossModule, AveragedModel]:
+def untrained_run(folder: Path, row: str, *overrides: str) -> tuple[Path, LossModule, AveragedModel]:
     """Write a run folder whose agent has its first weights, the average moved a little so that one can tell."""
-    cfg = tiny_cfg(row)
+    cfg = tiny_cfg(row, *overrides)
     trained = training_settings(cfg)
     loss = make_loss(trained, "cpu")
     average = make_average(loss, trained.learner)

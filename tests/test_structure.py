@@ -178,7 +178,14 @@ def test_every_key_of_the_configuration_is_explained() -> None:
     # A preset or a row may change a value without repeating what the key means.
     missing = [f"{name}: {key}" for name, key, commented in entries if not commented and key not in explained]
     assert not missing
-    for root in ("train.yaml", "evaluate.yaml", "draw_maps.yaml", "plot_training.yaml", "map/mixed.yaml"):
+    for root in (
+        "train.yaml",
+        "evaluate.yaml",
+        "export.yaml",
+        "draw_maps.yaml",
+        "plot_training.yaml",
+        "map/mixed.yaml",
+    ):
         assert all(commented for name, _, commented in entries if name == root), root
 
 

@@ -25,8 +25,10 @@ from rcdsac_trl.interface import (
 _SHARES = (1.0, 0.75, 0.5, 0.25)
 # Time from one place on the way to the next, s: 3 cm at full speed.
 _STEP_S = 0.05
-# Going by something that is already within the margin may not bring it nearer; more than rounding counts as nearer.
-_NEARER_M = 1e-6
+# What is in a sector may be anywhere in it, so a wall beside the robot looks up to this much nearer farther on: who is
+# within the margin may seem to come so much nearer, but never below the least that must stay.
+_BLUR_M = 0.01
+_LEAST_M = 0.01
 # Half the angle ahead (or behind) in which something must be sensed at all before the robot moves that way.
 _WAY_RAD = math.radians(30.0)
 
@@ -46,7 +48,8 @@ class Guard:
         max_reverse_m_per_s: backwards, as a positive number.
         max_turn_rad_per_s: either way.
         radius_m: of the circle around the robot's centre that holds the robot.
-        margin_m: what must stay between that circle and everything that is sensed.
+        margin_m: what is kept between that circle and everything that is sensed. Who is nearer, as when something
+            came up to the robot, may drive along it or away from it.
         reaction_s: how long a command may last until the next one arrives and acts.
         blind_reverse: whether the robot may drive backwards (or forwards) where it senses nothing at all.
 
@@ -115,20 +118,21 @@ class Guard:
         along = np.maximum(places @ np.stack((x, y)), near)
         apart = np.square(places[:, :1] - along * x) + np.square(places[:, 1:] - along * y)
         clearance = np.sqrt(apart.min(axis=1)) - self.radius_m
-        return bool((clearance >= min(self.margin_m, clearance[0]) - _NEARER_M).all())
+        needed = min(self.margin_m, max(clearance[0] - _BLUR_M, _LEAST_M), clearance[0])
+        return bool((clearance >= needed).all())
 
     def _way(self, v: float, omega: float, moving: tuple[float, float]) -> NDArray[np.float64]:
         """Return the places the robot's centre comes by until it stands, itself first, [n, 2]."""
         x = y = yaw = 0.0
         v_now, omega_now = moving
         places = [(0.0, 0.0)]
-        left_s = self.reaction_s
-        while left_s > 0.0 or abs(v_now) > 1e-9:
-            wanted = (v, omega) if left_s > 0.0 else (0.0, 0.0)
+        left = math.ceil(self.reaction_s / _STEP_S - 1e-9)
+        while left > 0 or abs(v_now) > 1e-9:
+            wanted = (v, omega) if left > 0 else (0.0, 0.0)
             v_now, omega_now = clip_command(*wanted, v_now, omega_now, _STEP_S)
             yaw += omega_now * _STEP_S / 2.0
             x, y = x + v_now * _STEP_S * math.cos(yaw), y + v_now * _STEP_S * math.sin(yaw)
             yaw += omega_now * _STEP_S / 2.0
             places.append((x, y))
-            left_s -= _STEP_S
+            left -= 1
         return np.array(places)

@@ -58,6 +58,17 @@ class Command:
     forgot: bool = False
 
 
+def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
+    """Return the midpoints of equal parts of [0, 1], float32 [num_quantiles].
+
+    Raises:
+        UserInputError: if the number is below 1.
+    """
+    if num_quantiles < 1:
+        raise UserInputError(f"num_quantiles={num_quantiles} is below 1: ask for at least one")
+    return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
+
+
 class Policy:
     """A trained agent that drives a robot.
 
@@ -85,12 +96,10 @@ class Policy:
         limits: InputLimits = InputLimits(),  # noqa: B008 (frozen)
         num_quantiles: int = 16,
     ) -> None:
-        if num_quantiles < 1:
-            raise UserInputError(f"num_quantiles={num_quantiles} is below 1: ask for at least one")
         self.config = weights.config
         self.guard = guard
         self.limits = limits
-        self.fractions = ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
+        self.fractions = fractions_of(num_quantiles)
         context = self.config.context_range
         middle = None if context is None else (context[0] + context[1]) / 2.0
         self.default_beta = middle if self.config.context == "beta" else None

@@ -1,6 +1,6 @@
 """All that a training or an evaluation may choose, checked as a whole.
 
-The two outermost classes are the roots of ``conf/train.yaml`` and ``conf/evaluate.yaml``.
+The three outermost classes are the roots of ``conf/train.yaml``, ``conf/evaluate.yaml`` and ``conf/export.yaml``.
 """
 
 from dataclasses import dataclass
@@ -148,6 +148,22 @@ class TrainingSettings:
         """Steps that the replay is made for: no more than the run can fill."""
         steps = self.schedule.iterations * self.world.num_agents * self.task.episode_steps
         return min(self.replay.capacity_steps, steps)
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """The root of ``conf/export.yaml``."""
+
+    run: str | None
+    checkpoint: Literal["best", "last"]
+    out: str | None
+    num_quantiles: int
+
+    def __post_init__(self) -> None:
+        """Refuse an export of nothing."""
+        if self.run is None:
+            raise UserInputError("name what to export: run=<folder>")
+        _check_least("num_quantiles", self.num_quantiles, 1)
 
 
 @dataclass(frozen=True)

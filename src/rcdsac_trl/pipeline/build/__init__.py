@@ -1,12 +1,15 @@
 """From the config to objects: the only package that reads ``cfg``."""
 
 from rcdsac_trl.pipeline.build.evaluation import evaluation
+from rcdsac_trl.pipeline.build.export import Export, export
 from rcdsac_trl.pipeline.build.resume import run_to_continue
 from rcdsac_trl.pipeline.build.training import check_training, failure, given_overrides, resumed, run_folder, trainer
 
 __all__ = [
+    "Export",
     "check_training",
     "evaluation",
+    "export",
     "failure",
     "given_overrides",
     "resumed",

@@ -1,0 +1,26 @@
+"""Export an agent for a robot: ``python -m rcdsac_trl.export run=<folder>``."""
+
+from omegaconf import DictConfig
+
+from rcdsac_trl.pipeline.cli import entry_point
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse what cannot work, before anything is written."""
+    from rcdsac_trl.pipeline import build
+
+    build.export(cfg)
+
+
+@entry_point("export", check=check)
+def main(cfg: DictConfig) -> None:
+    """Write weights, ONNX and torch programs, once they are seen to agree."""
+    from rcdsac_trl.pipeline import build
+
+    export = build.export(cfg)
+    export.run()
+    print(f"wrote {export.out}")
+
+
+if __name__ == "__main__":
+    main()

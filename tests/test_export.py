@@ -1,0 +1,94 @@
+"""What is exported computes what torch computes; the command says by how much, and refuses before it writes."""
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import rcdsac_trl
+from rcdsac_trl.deploy import Policy
+from rcdsac_trl.deploy.exported import LIMIT, Exported, check_extra, differences, export_agent
+from rcdsac_trl.deploy.weights import packed, read_weights
+from rcdsac_trl.errors import FaultError, UserInputError
+from rcdsac_trl.pipeline import build
+from rcdsac_trl.pipeline.build import Export
+from rcdsac_trl.pipeline.cli import compose
+from robots import AHEAD, OPEN, ROWS, STANDING, agent, full_size
+from test_deploy_weights import untrained_run
+
+pytest.importorskip("onnxscript")
+pytest.importorskip("onnxruntime")
+torch.set_num_threads(1)
+FILES = {"README.md", "actor.onnx", "actor.pt2", "config.json", "critics.onnx", "critics.pt2", "weights.safetensors"}
+
+
+@pytest.mark.parametrize("name", ["rcdsac_pow", "rcwr"])
+def test_programs_agree_with_torch_over_a_drive(name: str) -> None:
+    weights = agent(**ROWS[name])
+    found = differences(export_agent(weights, 4), weights, steps=100, num_betas=3)
+    assert found.keys() == {"ONNX Runtime", "torch.export", "NumPy"}
+    assert all(0.0 <= difference <= LIMIT for difference in found.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROWS)
+def test_programs_of_the_paper_s_size_agree_over_1000_steps_at_every_beta(name: str) -> None:
+    weights = full_size(**ROWS[name])
+    found = differences(export_agent(weights), weights)
+    assert max(found.values()) <= LIMIT, found
+
+
+def shifted(exported: Exported, by: float) -> Exported:
+    actor, critics = exported.runners["ONNX Runtime"]
+    runners = exported.runners | {
+        "ONNX Runtime": (lambda inputs: (actor(inputs)[0] + np.float32(by), actor(inputs)[1]), critics)
+    }
+    return Exported(exported.files, runners)
+
+
+def test_the_command_writes_a_folder_that_load_reads(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, _, _ = untrained_run(tmp_path / "run", "rcdsac_pow", "network.conv=4", "network.range=8")
+    asked = [f"run={run}", "checkpoint=last", "num_quantiles=4"]
+    export = build.export(compose("export", asked))
+    found = export.run(steps=20)
+    out = run / "export" / "last"
+    assert {path.name for path in out.iterdir()} == FILES
+    assert f"NumPy: largest difference from torch {found['NumPy']:.1e}" in capfd.readouterr().out
+    loaded = rcdsac_trl.load(out).act(OPEN, AHEAD, STANDING, -2.0)
+    assert loaded.wanted == Policy(export.weights).act(OPEN, AHEAD, STANDING, -2.0).wanted
+    assert packed(read_weights(out)) == packed(export.weights)
+    with pytest.raises(UserInputError, match="is not empty"):
+        build.export(compose("export", asked))
+
+    # What differs is not written.
+    made = export_agent(export.weights, 4)
+    monkeypatch.setattr("rcdsac_trl.pipeline.build.export.export_agent", lambda *_: shifted(made, 2.0 * LIMIT))
+    with pytest.raises(FaultError, match=r"differs from torch by 2\.\de-05, more than 1e-05: nothing was written"):
+        Export(export.weights, tmp_path / "other", 4).run(steps=5)
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ([], "name what to export: run=<folder>"),
+        (["run=nowhere"], r"holds no config\.yaml"),
+        (["run=x", "num_quantiles=0"], "num_quantiles=0 must be at least 1"),
+        (["run=x", "checkpoint=newest"], "checkpoint=newest must be one of best, last"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(asked: list[str], told: str) -> None:
+    with pytest.raises(UserInputError, match=told):
+        build.export(compose("export", asked))
+
+
+def test_a_missing_package_is_named_with_the_line_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    there: Callable = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnxruntime" else there(name))
+    with pytest.raises(UserInputError, match=r"onnxruntime is not installed: pip install 'rcdsac-trl\[export\]'"):
+        check_extra()
