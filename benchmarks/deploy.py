@@ -14,11 +14,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-for _library in ("OMP", "OPENBLAS", "MKL"):  # one core, before anything reads them
-    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
-
-import numpy as np
-
 import bench_world as bench
 
 CALLS = 3000
@@ -37,6 +32,9 @@ def main() -> None:
     parser = bench.parser(__doc__)
     parser.add_argument("--weights", type=Path, help="folder of weights to drive with; default: untrained ones")
     options = parser.parse_args()
+    for library in ("OMP", "OPENBLAS", "MKL"):  # before anything reads them
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    import numpy as np
     import torch
 
     from rcdsac_trl.deploy import Guard, Policy, read_weights

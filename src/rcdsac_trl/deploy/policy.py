@@ -159,7 +159,7 @@ class Policy:
                 raise BadInputError("stop() was called")
             return self._drive(ranges, waypoints, velocity, beta, collision_weight, stamps)
         except BadInputError as error:
-            return self._refuse(str(error))
+            return self.refuse(str(error))
 
     def _drive(
         self,
@@ -236,7 +236,8 @@ class Policy:
         told = None if reason is None else f"limited by {reason}; it ends when the cause does"
         return Command(v, omega, False, told, self._wanted, quantiles, value, fresh, forgot)
 
-    def _refuse(self, reason: str) -> Command:
+    def refuse(self, reason: str) -> Command:
+        """Return the command to stand for a reason that lies outside, and count it as bad input."""
         self._refused += 1
         self._commanded = (0.0, 0.0)
         self._wanted = self._told = None

@@ -43,8 +43,8 @@ class Export:
             print(f"{name:>12}: largest difference from torch {difference:.1e}")
         if not max(found.values()) <= LIMIT:
             raise FaultError(
-                f"the export differs from torch by {max(found.values()):.1e}, more than {LIMIT:g}: nothing was written; "
-                "use the package versions of constraints.txt"
+                f"the export differs from torch by {max(found.values()):.1e}, more than {LIMIT:g}: nothing was "
+                "written; use the package versions of constraints.txt"
             )
         self.out.mkdir(parents=True, exist_ok=True)
         # The config comes last: a folder that has one is complete.
