@@ -25,7 +25,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.interface import MAX_RANGE_OBSERVATION, NUM_BINS, sensor_mask
 
 LIMIT = 1e-5
-"""How far results may be from torch's: absolute, and relative for quantiles beyond 1."""
+"""How far results may be from torch's: absolute, and for quantiles relative to the largest of them if it is beyond 1."""
 _EXTRA = ("onnx", "onnxscript", "onnxruntime")
 _ACTOR_INPUTS = ("range", "waypoint", "velocity", "context", "memory")
 _CRITIC_INPUTS = ("range", "waypoint", "velocity", "context", "action", "memories")
@@ -96,8 +96,8 @@ def export_agent(weights: Weights, num_quantiles: int = 16) -> Exported:
 def differences(exported: Exported, weights: Weights, *, steps: int = 1000, num_betas: int = 5) -> dict[str, float]:
     """Return the largest difference of each kind of program from torch, each with a memory of its own.
 
-    Every ``beta`` of a grid over the trained range is driven for a whole drive. Differences of what is larger than 1
-    count relative to it.
+    Every ``beta`` of a grid over the trained range is driven for a whole drive. Differences count
+    absolutely, those of quantiles relative to the largest of them if that is beyond 1.
 
     Args:
         exported: from :func:`export_agent`.
@@ -117,8 +117,9 @@ def differences(exported: Exported, weights: Weights, *, steps: int = 1000, num_
                 expected = expected or found
                 for key, value in found.items():
                     if name != "torch":
-                        apart = np.abs(value - expected[key]) / np.maximum(1.0, np.abs(expected[key]))
-                        largest[name] = max(largest[name], float(apart.max()))
+                        # Quantiles are sums of terms as large as the largest of them, rounded as those are.
+                        scale = max(1.0, float(np.abs(expected[key]).max()))
+                        largest[name] = max(largest[name], float(np.abs(value - expected[key]).max()) / scale)
     return largest
 
 
