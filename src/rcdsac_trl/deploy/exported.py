@@ -25,7 +25,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.interface import MAX_RANGE_OBSERVATION, NUM_BINS, sensor_mask
 
 LIMIT = 1e-5
-"""How far results may be from torch's: absolute, and for quantiles relative to the largest of them if it is beyond 1."""
+"""How far results may be from torch's: absolute; of quantiles, relative to the largest if that is beyond 1."""
 _EXTRA = ("onnx", "onnxscript", "onnxruntime")
 _ACTOR_INPUTS = ("range", "waypoint", "velocity", "context", "memory")
 _CRITIC_INPUTS = ("range", "waypoint", "velocity", "context", "action", "memories")
