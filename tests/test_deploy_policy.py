@@ -201,7 +201,7 @@ def test_stop_holds_until_resume() -> None:
 def test_a_repeated_scan_holds_the_command_and_is_guarded_anew() -> None:
     policy = Policy(full_size())
     first = policy.act(**GOOD, stamps=at(10.0))
-    wall = np.full(180, 0.3)
+    wall = np.full(180, 0.26)
     same_scan = replace(at(10.14), scan_s=9.95)
     held = policy.act(**(GOOD | {"ranges": wall}), stamps=same_scan)
     assert (held.fresh, held.wanted, held.v_m_per_s) == (False, first.wanted, 0.0)

@@ -48,8 +48,8 @@ class Guard:
         max_reverse_m_per_s: backwards, as a positive number.
         max_turn_rad_per_s: either way.
         radius_m: of the circle around the robot's centre that holds the robot.
-        margin_m: what is kept between that circle and everything that is sensed. Who is nearer, as when something
-            came up to the robot, may drive along it or away from it.
+        margin_m: what is kept between that circle and everything that is sensed. Who is nearer may drive along it
+            or away from it, and nearer by 1 cm a call, the blur of a sector, until 1 cm is left.
         reaction_s: how long a command may last until the next one arrives and acts.
         blind_reverse: whether the robot may drive backwards (or forwards) where it senses nothing at all.
 
