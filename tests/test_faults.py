@@ -230,19 +230,24 @@ def test_no_checkpoint_is_begun_that_the_disk_cannot_hold(tmp_path: Path, monkey
     assert list((tmp_path / "run" / "checkpoints").iterdir()) == []
 
 
-def test_a_real_limit_on_files_ends_a_run_in_one_sentence(tmp_path: Path) -> None:
-    """In a process of its own: no file may be larger than one limit, which the replay's later files are not."""
+@pytest.mark.parametrize(("backends", "limit_bytes"), [("", 3000), ("tensorboard", 1000)])
+def test_a_real_limit_on_files_ends_a_run_in_one_sentence(tmp_path: Path, backends: str, limit_bytes: int) -> None:
+    """In a process of its own: the limit on a file's size is less than what the replay, or TensorBoard's thread, needs.
+
+    TensorBoard's thread cannot end the run itself.
+    """
     program = (
         "import resource, sys\n"
         "from pathlib import Path\n"
         "from tiny import tiny_trainer\n"
         "from rcdsac_trl.pipeline import cli\n"
         "from rcdsac_trl.errors import TrainingError\n"
-        "trainer = tiny_trainer(Path(sys.argv[1]), 'rcdsac_pow', 'checkpoint.every_iterations=1')\n"
+        "given = ['checkpoint.every_iterations=1', f'logger.backends=[{sys.argv[2]}]']\n"
+        "trainer = tiny_trainer(Path(sys.argv[1]), 'rcdsac_pow', *given)\n"
         "save = trainer.checkpoints.save\n"
         "def limited(progress, logs):\n"
         "    path = save(progress, logs)\n"
-        "    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)\n"
         "    return path\n"
         "trainer.checkpoints.save = limited\n"
         "try:\n"
@@ -253,16 +258,18 @@ def test_a_real_limit_on_files_ends_a_run_in_one_sentence(tmp_path: Path) -> Non
     run = tmp_path / "run"
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     ended = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program, str(run)],
+        [sys.executable, "-W", "ignore", "-c", program, str(run), backends, str(limit_bytes)],
         env=os.environ | {"PYTHONPATH": path, "RL_LOGGING_LEVEL": "WARNING"},
         capture_output=True,
         text=True,
         timeout=300,
     )
     assert ended.returncode == 1, ended.stderr
-    assert "Traceback" not in ended.stderr
-    assert re.search(r"rcdsac_trl: a file became larger than .* training stops in iteration 1; 0 iterations are saved",
-                     ended.stderr)  # fmt: skip
+    told = (
+        r"rcdsac_trl: a file became larger than this system or its limits allow \(.*File too large\): training stops "
+        rf"in iteration 1; 0 iterations are saved, resume={run} continues there\n"
+    )
+    assert re.fullmatch(told, ended.stderr), ended.stderr
     saved, damaged = newest(run / CHECKPOINTS, replay=run / "replay")
     assert (saved.progress.iterations, damaged) == (0, [])
 

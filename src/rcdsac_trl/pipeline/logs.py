@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -28,6 +29,8 @@ from rcdsac_trl.pipeline.saved import CHECKPOINTS
 CONFIG_NAME = "config.yaml"
 MANIFEST_NAME = "manifest.json"
 TRAINING_TABLE = "training_episodes.csv"
+# Where the thread is defined that writes TensorBoard's files.
+_TENSORBOARD_WRITER = "tensorboard.summary.writer.event_file_writer"
 _EXTRAS = {"wandb": "wandb", "mlflow": "mlflow"}
 _PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "gymnasium", "hydra-core", "numpy", "numba", "rcdsac-trl")
 
@@ -140,6 +143,8 @@ class RunLog:
             get_logger(name, logger_name=str(folder), experiment_name=name) for name in backends
         ]
         self._file = (folder / "train.log").open("a", buffering=1)
+        self._excepthook = threading.excepthook
+        threading.excepthook = self._thread_failed
         for logger in self._loggers:
             if isinstance(logger, TensorboardLogger) and continued_at is not None:
                 start = SessionLog(status=SessionLog.START)
@@ -188,7 +193,13 @@ class RunLog:
             values = "  ".join(f"{metric} {row[metric]:.3g}" for metric in METRICS)
             self.message(f"     validation after {iterations} iterations {Condition(beta, weight)!s:>10}  {values}")
 
+    def _thread_failed(self, args: threading.ExceptHookArgs) -> None:
+        """Print no traceback of TensorBoard's writer: its next call raises the same error where it can be served."""
+        if type(args.thread).__module__ != _TENSORBOARD_WRITER or not isinstance(args.exc_value, OSError):
+            self._excepthook(args)
+
     def close(self) -> None:
         """Close what is open, on a full disk too."""
+        threading.excepthook = self._excepthook
         with contextlib.suppress(OSError):
             self._file.close()
