@@ -106,6 +106,7 @@ PLACES = list(leaves(TRAINING))
 def test_a_training_reads_or_refuses_any_value_of_any_key(few: int) -> None:
     @tries(few)
     @given(st.sampled_from(PLACES), VALUES)
+    @example(("seed",), "\n")
     def holds(at: tuple[Any, ...], value: Any) -> None:
         refused_or_read(lambda: build.check_training(OmegaConf.create(changed(TRAINING, at, value))))
 
@@ -157,6 +158,7 @@ def test_the_command_line_reads_or_refuses_any_override(few: int) -> None:
     @tries(few)
     @given(st.sampled_from([*keys, "nokey", "+new", "~seed", "", "+", "a.b.c"]), words)
     @example("seed", "1e999")
+    @example("+", "")
     @example("task", "{")
     def holds(key: str, word: str) -> None:
         refused_or_read(lambda: build.check_training(compose("train", ["+algo=rcdsac_pow", f"{key}={word}"])))

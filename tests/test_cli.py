@@ -106,6 +106,7 @@ def refusal(
         ([POW, "seed=1.5"], "seed=1.5 must be a whole number"),
         ([POW, "seed=true"], "seed=True must be a whole number"),
         ([POW, "seed=-1"], "seed=-1 must be at least 0"),
+        ([POW, "seed='\n\x1b[2J'"], r"seed=\n\x1b[2J must be a whole number"),
         ([POW, "seed=???"], "seed=??? must be a whole number"),
         ([POW, "schedule.iterations=0"], "schedule.iterations=0 is not a number of at least 1"),
         ([POW, "schedule.pursuit_noise=-1"], "schedule.pursuit_noise=-1 is not a number of at least 0"),
@@ -141,6 +142,8 @@ def refusal(
         ),
         # what Hydra itself refuses
         ([POW, "learner.batch_size=["], "learner.batch_size=[ cannot be read: write it as <key>=<value>"),
+        ([POW, "+="], "+= names no key: write it as <key>=<value>"),
+        ([POW, "hydra/launcher=far"], "hydra/launcher=far does not exist: leave it out"),
         ([POW, "fast"], "fast cannot be read: write it as <key>=<value>"),
         ([POW, "seed=${foo}"], "Interpolation key 'foo' not found"),
         ([POW, "seed=0,1"], "seed=0,1 holds several values: write a list in brackets, or add -m"),

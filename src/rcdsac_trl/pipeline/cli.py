@@ -160,6 +160,9 @@ def compose(config_name: str, overrides: list[str]) -> DictConfig:
 
 
 def _compose(config_name: str, overrides: list[str], *, return_hydra_config: bool = False) -> DictConfig:
+    for override in overrides:
+        if not override.lstrip("+~").partition("=")[0].partition("@")[0].strip():  # Hydra fails an assertion
+            raise UserInputError(f"{override} names no key: write it as <key>=<value>")
     # Inside a Hydra main the search path is set up already, and setting it up twice is an error.
     inside = GlobalHydra.instance().is_initialized()
     with nullcontext() if inside else hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
@@ -180,7 +183,8 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
         return f"{error.override} cannot be read: write it as <key>=<value>, and lists in brackets"
     if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']+)'", text):
         group, name = match.groups()
-        return f"{group}={name} does not exist: choose one of {', '.join(choices(group))}"
+        known = choices(group)
+        return f"{group}={name} does not exist: " + (f"choose one of {', '.join(known)}" if known else "leave it out")
     for override in overrides:
         group, _, name = override.lstrip("+").partition("=")
         if name == "null" and choices(group):
