@@ -317,6 +317,26 @@ def test_a_replay_larger_than_the_memory_is_refused_before_anything_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_mini_batch_larger_than_any_memory_is_refused(
+    tmp_path: Path, command: Callable[..., tuple[int, str]]
+) -> None:
+    code, err = command("+algo=sac", "preset=smoke", "learner.batch_size=1000000000", f"hydra.run.dir={tmp_path}/run")
+    assert code == 2
+    assert err.startswith("rcdsac_trl: a mini-batch needs 6480.0 GB of memory, ")  # (8 + 1) * 180 * 4 bytes each
+    assert err.endswith(" GB are available: lower learner.batch_size, or end other programs\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_networks_that_do_not_fit_leave_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def too_large(*_: object) -> None:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 51200000000 bytes.")
+
+    monkeypatch.setattr("rcdsac_trl.pipeline.build.training.make_loss", too_large)
+    with pytest.raises(RuntimeError, match="can't allocate"):
+        tiny_trainer(tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_available_memory_is_the_least_of_what_the_machine_and_the_group_leave(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

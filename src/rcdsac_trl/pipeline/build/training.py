@@ -64,8 +64,12 @@ def check_training(cfg: DictConfig) -> None:
 
 
 def _check_memory(settings: TrainingSettings) -> None:
-    remedy = "lower replay.capacity_steps, or end other programs"
-    resources.check_memory("the replay", _replay_bytes(settings), remedy)
+    """Refuse what surely does not fit; of a mini-batch its range observations alone are counted."""
+    learner, others = settings.learner, "or end other programs"
+    resources.check_memory("the replay", _replay_bytes(settings), f"lower replay.capacity_steps, {others}")
+    observations = learner.batch_size * (learner.sequence_length + 1)
+    batch_bytes = observations * sensor_mask(settings.sensor.name).size * torch.float32.itemsize
+    resources.check_memory("a mini-batch", batch_bytes, f"lower learner.batch_size, {others}")
 
 
 def _replay_bytes(settings: TrainingSettings) -> int:
@@ -124,11 +128,12 @@ def trainer(cfg: DictConfig, folder: Path, overrides: Sequence[str] = ()) -> Tra
         "allocator": runtime.allocator(),
     }
     logs.check_folder(folder)
+    learner = _learner_here(settings)  # before anything is written: it may not fit into the memory
     folder.mkdir(parents=True, exist_ok=True)
     lock = FolderLock(folder)
     try:
         logs.start_run_folder(folder, cfg, facts)
-        return _assemble(settings, folder, lock, None, [])
+        return _assemble(settings, learner, folder, lock, None, [])
     except BaseException:
         lock.close()
         raise
@@ -151,7 +156,7 @@ def resumed(folder: Path) -> Trainer | None:
                 rotate(folder / CHECKPOINTS, keep=settings.checkpoint.keep, replay=folder / REPLAY)
             lock.close()
             return None
-        return _assemble(settings, folder, lock, saved, damaged)
+        return _assemble(settings, _learner_here(settings), folder, lock, saved, damaged)
     except BaseException:
         lock.close()
         raise
@@ -174,11 +179,16 @@ def has_begun(folder: Path) -> bool:
     return (folder / logs.TRAINING_TABLE).exists() or any((folder / CHECKPOINTS).glob("[!.]*"))
 
 
+def _learner_here(settings: TrainingSettings) -> Learner:
+    """Make the learner with the threads and on the device that this machine gives the run."""
+    runtime.set_threads(settings.threads)
+    return make_learner(settings, runtime.resolve_device(settings.device))
+
+
 def _assemble(
-    settings: TrainingSettings, folder: Path, lock: FolderLock, saved: Saved | None, told: list[str]
+    settings: TrainingSettings, learner: Learner, folder: Path, lock: FolderLock, saved: Saved | None, told: list[str]
 ) -> Trainer:
-    device, threads = runtime.resolve_device(settings.device), runtime.set_threads(settings.threads)
-    learner = make_learner(settings, device)
+    device, threads = runtime.resolve_device(settings.device), runtime.resolve_threads(settings.threads)
     loss, average, optimizer, relabel = learner.loss, learner.average, learner.optimizer, learner.relabel
     generators = {"replay": learner.replay.generator}
     if relabel is not None and relabel.generator is not None:
