@@ -148,6 +148,13 @@ def refusal(
         ([POW, "seed=${foo}"], "Interpolation key 'foo' not found"),
         ([POW, "seed=0,1"], "seed=0,1 holds several values: write a list in brackets, or add -m"),
         ([POW, "--fast"], "there is no option --fast"),
+        ([POW, "--config-dir=/nowhere"], "--config-dir cannot be used: choose with overrides"),
+        ([POW, "--config-name=evaluate"], "--config-name cannot be used: choose with overrides"),
+        ([POW, "--run", "-m"], "--run and --multirun do not go together: leave all but one out"),
+        ([POW, "hydra.run.dir=''"], "hydra.run.dir names no folder: give it one, or leave it out"),
+        ([POW, "hydra.run.dir=/proc/x/y"], "nothing can be written into /proc ("),
+        ([POW, "resume="], "resume names no folder: give it one, or auto, or leave it out"),
+        ([POW, "threads=1000000"], "threads=1000000 is above 1024: "),
         # a multirun is checked whole, before its first job
         (["-m", POW, "seed=0,abc"], "seed=abc must be a whole number"),
         (["-m", "+algo=sac,ppo"], "algo=ppo does not exist"),

@@ -284,11 +284,16 @@ def test_a_folder_that_takes_nothing_is_refused_before_anything_is_written(
         2,
         f"rcdsac_trl: {file}/run cannot be a folder: {file} is a file, choose another\n",
     )
-    monkeypatch.setattr("rcdsac_trl.pipeline.resources.os.access", lambda *_: False)  # root may always write
+
+    def read_only(**_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("rcdsac_trl.pipeline.resources.tempfile.TemporaryFile", read_only)
     code, err = command(*START, f"hydra.run.dir={tmp_path}/a/run")
     assert (code, err) == (
         2,
-        f"rcdsac_trl: nothing can be written into {tmp_path}: choose a folder elsewhere than {tmp_path}/a/run\n",
+        f"rcdsac_trl: nothing can be written into {tmp_path} (Read-only file system): choose a folder elsewhere than "
+        f"{tmp_path}/a/run\n",
     )
     assert list(tmp_path.iterdir()) == [file]
 

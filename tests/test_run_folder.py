@@ -93,6 +93,13 @@ def test_a_folder_that_holds_a_part_of_a_run_holds_a_run(tiny_run: Path, tmp_pat
     assert files_of(tmp_path) == before
 
 
+def test_a_lock_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "lock").mkdir()
+    with pytest.raises(UserInputError, match=rf"^{tmp_path}/lock cannot be opened \(Is a directory\): remove it$"):
+        tiny_trainer(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+
+
 def test_runs_started_in_the_same_second_get_folders_of_their_own() -> None:
     given = ["+algo=rcdsac_pow"]
     assert len({output_folder("train", given) for _ in range(3)}) == 3

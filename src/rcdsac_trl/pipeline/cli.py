@@ -95,11 +95,17 @@ def read_arguments(argv: list[str]) -> Namespace | None:
     """Read Hydra's arguments (`overrides`, `multirun`, ..); None if they only show something (``--help``, ``--cfg``).
 
     Raises:
-        UserInputError: for an option that does not exist.
+        UserInputError: for an option that does not exist, cannot be used, or does not go with another.
     """
     args, unknown = get_args_parser().parse_known_args(argv)
     if unknown:
         raise UserInputError(f"there is no option {unknown[0]}: --help lists them")
+    for option in ("config_path", "config_name", "config_dir"):
+        if getattr(args, option) is not None:
+            raise UserInputError(f"--{option.replace('_', '-')} cannot be used: choose with overrides, <key>=<value>")
+    chosen = [f"--{option}" for option in ("run", "multirun", "cfg", "info") if getattr(args, option)]
+    if len(chosen) > 1:
+        raise UserInputError(f"{' and '.join(chosen)} do not go together: leave all but one out")
     return None if args.help or args.hydra_help or args.cfg or args.info else args
 
 
@@ -130,7 +136,10 @@ def precheck(
 def output_folder(config_name: str, overrides: list[str], *, job_number: int | None = None) -> Path:
     """Return the folder that a run would write into, where it is a job of a multirun as the job of that number."""
     if job_number is None:
-        return Path(_compose(config_name, overrides, return_hydra_config=True).hydra.run.dir)
+        folder = _compose(config_name, overrides, return_hydra_config=True).hydra.run.dir
+        if not folder:
+            raise UserInputError("hydra.run.dir names no folder: give it one, or leave it out")
+        return Path(folder)
     given = [*overrides, f"hydra.job.num={job_number}"]
     sweep = _compose(config_name, given, return_hydra_config=True).hydra.sweep
     return Path(sweep.dir) / str(sweep.subdir)

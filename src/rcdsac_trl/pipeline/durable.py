@@ -115,11 +115,14 @@ class FolderLock:
         folder: must exist.
 
     Raises:
-        UserInputError: if another process holds it.
+        UserInputError: if another process holds it, or it cannot be opened.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._file = (folder / "lock").open("a")
+        try:
+            self._file = (folder / "lock").open("a")
+        except OSError as error:
+            raise UserInputError(f"{folder / 'lock'} cannot be opened ({error.strerror}): remove it") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

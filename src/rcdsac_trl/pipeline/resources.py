@@ -4,8 +4,8 @@ Nothing here imports torch: entry points read it before they know that their inp
 """
 
 import errno
-import os
 import shutil
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -55,8 +55,13 @@ def check_writable(folder: Path) -> None:
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise UserInputError(f"{folder} cannot be a folder: {existing} is a file, choose another")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise UserInputError(f"nothing can be written into {existing}: choose a folder elsewhere than {folder}")
+    try:
+        with tempfile.TemporaryFile(dir=existing):  # permissions alone do not tell
+            pass
+    except OSError as error:
+        raise UserInputError(
+            f"nothing can be written into {existing} ({error.strerror}): choose a folder elsewhere than {folder}"
+        ) from error
 
 
 def available_memory_bytes() -> int | None:

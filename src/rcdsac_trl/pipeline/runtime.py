@@ -16,6 +16,8 @@ _GLIBC_KEEPS_PAGES = {
     "MALLOC_TRIM_THRESHOLD_": str(1 << 40),
     "MALLOC_TOP_PAD_": str(1 << 26),
 }
+# From some such number on the libraries that start them die instead of refusing.
+_MAX_THREADS = 1024
 
 
 def keep_pages() -> None:
@@ -84,6 +86,8 @@ def resolve_threads(threads: int | str) -> int:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not isinstance(threads, int) or threads < 1:
         raise UserInputError(f"threads={threads} is not a whole number of at least 1: use that or auto")
+    if threads > _MAX_THREADS:
+        raise UserInputError(f"threads={threads} is above {_MAX_THREADS}: use as many as there are cores, or auto")
     return threads
 
 

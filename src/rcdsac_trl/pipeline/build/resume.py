@@ -39,6 +39,8 @@ def run_to_continue(overrides: list[str], *, multirun: bool) -> Path | None:
     cfg = compose("train", overrides)
     if cfg.resume is None:
         return None
+    if cfg.resume == "":
+        raise UserInputError("resume names no folder: give it one, or auto, or leave it out")
     if cfg.resume == AUTO:
         check_training(cfg)
         return _newest_unfinished(overrides)
