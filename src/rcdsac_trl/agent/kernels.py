@@ -1,165 +1,256 @@
-r"""The range observation's layers on a CPU, with their backward pass written out.
+r"""An observation's layers up to the recurrent one on a CPU, with their backward pass written out.
 
 They compute exactly what ordinary layers do (tests hold them against those, and against finite differences) and exist
-because on a CPU an update spends its time moving memory, not multiplying: every intermediate of a batch
-of 6,500 observations is tens of megabytes, written and read again by the next operation. Here a batch goes through all
-layers in blocks that stay in the cache, activations are rectified in place, and bins that are silent in the whole
-batch, such as those a narrow sensor lacks, are left out.
+because on a CPU an update spends its time moving memory and calling operations, not multiplying. Here a batch goes
+through the range observation's layers in blocks that stay in the cache; what is not a matrix product is one compiled
+pass; all layers write into one array of features; and bins that are silent in the whole batch, such as those a
+narrow sensor lacks, are left out.
 
 Public names::
 
-    range_features(bins [n,180], conv_1, conv_2, linear) -> [n, features]
+    observation_features(bins [n,180], vectors [n,k].., (conv_1, conv_2, linear), layers) -> [n, features]
+    rectify(rows, bias)     adds the bias and rectifies in place; compiled
 """
 
+from collections.abc import Sequence
 from typing import Any
 
+import numba
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
-from torch.nn import functional as F
 
-# Rows of two positions that go through the layers together: their activations take about 1 MB, which a core's own
-# cache holds.
-_ROWS_PER_BLOCK = 96 * 44
-
-
-def _rectify_gradient(gradient: Tensor, activation: Tensor) -> Tensor:
-    """Zero ``gradient`` in place where a rectified ``activation`` is zero."""
-    return torch.ops.aten.threshold_backward.grad_input(gradient, activation, 0, grad_input=gradient)
+# Windows of the second convolution that go through the layers together: their inputs and activations take some 2 MB.
+_ROWS_PER_BLOCK = 96 * 43
+# Positions of the first convolution that one of the second sees, its kernel's size; both have stride 2.
+_SEEN = 3
 
 
-# ------------------------------------------------------------------------------------------------ range features
-class _RangeFeatures(torch.autograd.Function):
-    """Convolution 5/2, convolution 3/2, linear layer, each rectified; activations are [n, row, channel].
+# ------------------------------------------------------------------------------------------------ compiled passes
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rectify(rows: np.ndarray, bias: np.ndarray) -> None:
+    """Add the bias to every row and rectify, in place."""
+    zero = rows.dtype.type(0)
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        for h in range(row.size):
+            row[h] = max(row[h] + bias[h], zero)
 
-    A row is two positions of the first convolution. The second one's window is contiguous memory, a row and the first
-    half of the next, so that a run of its positions [a, b) takes the rows a .. b; the position of row b is one too
-    many, and the linear layer's weight is zero there. Positions outside all runs see silent bins alone: their
-    activation is the same for every observation, and joins the linear layer's bias.
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _heard(bins: np.ndarray, taps: int) -> np.ndarray:
+    """Return the positions of the second convolution that see a bin which is not 0 in all the batch, or the first."""
+    sounds = np.zeros(bins.shape[1], np.uint8)
+    for o in range(bins.shape[0]):
+        row = bins[o]
+        for i in range(row.size):
+            sounds[i] |= row[i] != 0
+    last = ((bins.shape[1] - taps) // 2 + 1 - _SEEN) // 2
+    span = 2 * (_SEEN - 1) + taps
+    return np.array([p for p in range(last + 1) if p == 0 or sounds[4 * p : 4 * p + span].any()], np.int64)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _first_layer(
+    bins: np.ndarray, positions: np.ndarray, weight: np.ndarray, bias: np.ndarray, windows: np.ndarray
+) -> None:
+    """Write the rectified first convolution at all positions that each position of the second sees, side by side."""
+    zero, channels = bins.dtype.type(0), bias.size
+    for o in range(bins.shape[0]):
+        row = bins[o]
+        for p in range(positions.size):
+            window = windows[o * positions.size + p]
+            for s in range(_SEEN):
+                i, j = 4 * positions[p] + 2 * s, s * channels
+                x0, x1, x2, x3, x4 = row[i], row[i + 1], row[i + 2], row[i + 3], row[i + 4]
+                for c in range(channels):
+                    value = bias[c] + x0 * weight[0, c] + x1 * weight[1, c] + x2 * weight[2, c]
+                    window[j + c] = max(value + x3 * weight[3, c] + x4 * weight[4, c], zero)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _first_layer_gradient(
+    bins: np.ndarray,
+    positions: np.ndarray,
+    windows: np.ndarray,
+    d_windows: np.ndarray,
+    d_weight: np.ndarray,
+    d_bias: np.ndarray,
+) -> None:
+    """Add the gradients of the first convolution's weight ``[taps, channels]`` and bias."""
+    zero, channels = bins.dtype.type(0), d_bias.size
+    for o in range(bins.shape[0]):
+        row = bins[o]
+        for p in range(positions.size):
+            window, d_window = windows[o * positions.size + p], d_windows[o * positions.size + p]
+            for s in range(_SEEN):
+                i, j = 4 * positions[p] + 2 * s, s * channels
+                x0, x1, x2, x3, x4 = row[i], row[i + 1], row[i + 2], row[i + 3], row[i + 4]
+                for c in range(channels):
+                    slope = d_window[j + c] if window[j + c] > zero else zero
+                    d_bias[c] += slope
+                    d_weight[0, c] += x0 * slope
+                    d_weight[1, c] += x1 * slope
+                    d_weight[2, c] += x2 * slope
+                    d_weight[3, c] += x3 * slope
+                    d_weight[4, c] += x4 * slope
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _divide(by_position: np.ndarray, positions: np.ndarray, heard: np.ndarray, silent: np.ndarray) -> None:
+    """Copy the linear layer's weight ``[features, position, channel]`` where heard, and add it up where silent."""
+    for f in range(by_position.shape[0]):
+        total, number = silent[f], 0
+        for c in range(total.size):
+            total[c] = 0
+        for p in range(by_position.shape[1]):
+            row = by_position[f, p]
+            if number < positions.size and positions[number] == p:
+                out = heard[f, number]
+                for c in range(row.size):
+                    out[c] = row[c]
+                number += 1
+            else:
+                for c in range(row.size):
+                    total[c] += row[c]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _unite(
+    d_by_position: np.ndarray, positions: np.ndarray, d_heard: np.ndarray, d_bias: np.ndarray, value: np.ndarray
+) -> None:
+    """Write the gradient of the linear layer's weight: silent positions all have the same activation."""
+    for f in range(d_by_position.shape[0]):
+        number = 0
+        for p in range(d_by_position.shape[1]):
+            row = d_by_position[f, p]
+            if number < positions.size and positions[number] == p:
+                out = d_heard[f, number]
+                for c in range(row.size):
+                    row[c] = out[c]
+                number += 1
+            else:
+                for c in range(row.size):
+                    row[c] = d_bias[f] * value[c]
+
+
+# ------------------------------------------------------------------------------------------------ features
+class _ObservationFeatures(torch.autograd.Function):
+    """Convolution 5/2, convolution 3/2, linear layer over the bins; a linear layer for every vector; all rectified.
+
+    A row is what a position of the second convolution sees, so that this is one matrix product. Positions that
+    see silent bins alone have no rows: their activation is the same for every observation, and joins the linear
+    layer's bias. The first convolution costs so little that its activations are computed again on the way back.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        bins: Tensor,
-        w1: Tensor,
-        b1: Tensor,
-        w2: Tensor,
-        b2: Tensor,
-        w3: Tensor,
-        b3: Tensor,
-        runs: list[tuple[int, int]],
-    ) -> Tensor:
-        channels, taps = w1.shape[0], w1.shape[2]
-        kernel_1 = torch.cat((w1.view(channels, taps), b1.unsqueeze(1)), dim=1).t().contiguous()
-        kernel_2 = w2.permute(2, 1, 0)
-        pair, third = kernel_2[:2].reshape(2 * channels, channels), kernel_2[2].contiguous()
-        by_position = w3.view(w3.shape[0], -1, channels)
-        kernel_3 = torch.cat([F.pad(by_position[:, a:b], (0, 0, 0, 1)) for a, b in runs], dim=1).flatten(1)
+    def forward(ctx: Any, bins: Tensor, vectors: Sequence[Tensor], *parameters: Tensor) -> Tensor:
+        w1, b1, w2, b2, w3, b3, *others = parameters
+        positions = _heard(bins.numpy(), w1.shape[2])
+        kernel = w2.permute(2, 1, 0).reshape(-1, w2.shape[0])  # [position seen and channel, channel]
+        taps = w1[:, 0].t().contiguous().numpy()
+        heard, silent = _divided(w3, positions, w2.shape[0])
         silent_1 = b1.relu()
-        silent_2 = (b2 + w2.sum(-1) @ silent_1).relu()
-        gaps = zip([0, *(b for _, b in runs)], [*(a for a, _ in runs), by_position.shape[1]], strict=True)
-        silent_3 = torch.cat([by_position[:, a:b] for a, b in gaps], dim=1).sum(1)
-        bias_3 = b3 + silent_3 @ silent_2
-        result = bins.new_empty(bins.shape[0], w3.shape[0])
-        saved: list[Tensor] = []
-        block_size = _block_size(runs)
-        for start in range(0, bins.shape[0], block_size):
-            block = bins[start : start + block_size]
-            first = torch.mm(_windows(block, taps, runs), kernel_1).relu_()
-            rows = first.view(-1, 2 * channels)
-            second = torch.addmm(b2, rows, pair)
-            second[:-1].addmm_(rows[1:, :channels], third)
-            second.relu_()
-            out = result[start : start + block_size]
-            torch.addmm(bias_3, second.view(block.shape[0], -1), kernel_3.t(), out=out).relu_()
-            if any(ctx.needs_input_grad):
-                saved += [first, second]
-        ctx.save_for_backward(bins, w2, pair, third, kernel_3, silent_1, silent_2, silent_3, result, *saved)
-        ctx.shapes, ctx.runs = (w1.shape, by_position.shape), runs
+        silent_2 = torch.addmv(b2, kernel.t(), silent_1.repeat(_SEEN)).relu_()
+        widths = [len(b3), *(len(bias) for bias in others[1::2])]
+        result = bins.new_empty(len(bins), sum(widths))
+        range_features, *vector_features = result.split(widths, dim=1)
+        activations = bins.new_empty(len(bins) * len(positions), w2.shape[0])
+        windows = _window_buffer(bins, positions, kernel)
+        for rows, block in _blocks(len(bins), len(positions)):
+            window = windows[: rows.stop - rows.start]
+            _first_layer(bins[block].numpy(), positions, taps, b1.numpy(), window.numpy())
+            torch.mm(window, kernel, out=activations[rows])
+            rectify(activations[rows].numpy(), b2.numpy())
+            torch.mm(activations[rows].view(-1, heard.shape[1]), heard.t(), out=range_features[block])
+        for vector, weight, out in zip(vectors, others[::2], vector_features, strict=True):
+            torch.mm(vector, weight.t(), out=out)
+        rectify(result.numpy(), torch.cat((torch.addmv(b3, silent, silent_2), *others[1::2])).numpy())
+        ctx.save_for_backward(bins, w1, b1, kernel, heard, silent, silent_1, silent_2, activations, result, *vectors)
+        ctx.positions, ctx.taps, ctx.widths, ctx.shape_3 = positions, taps, widths, w3.shape
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        bins, w2, pair, third, kernel_3, silent_1, silent_2, silent_3, result, *saved = ctx.saved_tensors
-        (shape_1, shape_3), runs = ctx.shapes, ctx.runs
-        channels, taps = shape_1[0], shape_1[2]
+        bins, w1, b1, kernel, heard, silent, silent_1, silent_2, activations, result, *vectors = ctx.saved_tensors
+        positions, taps, channels = ctx.positions, ctx.taps, len(b1)
         gradient = torch.ops.aten.threshold_backward(gradient, result, 0)
-        d_kernel_1 = bins.new_zeros(taps + 1, channels)
-        d_pair, d_third = torch.zeros_like(pair), torch.zeros_like(third)
-        d_b2, d_kernel_3 = bins.new_zeros(channels), torch.zeros_like(kernel_3)
-        block_size = _block_size(runs)
-        for index, start in enumerate(range(0, bins.shape[0], block_size)):
-            first, second = saved[2 * index], saved[2 * index + 1]
-            out = gradient[start : start + block_size]
-            rows = first.view(-1, 2 * channels)
-            d_kernel_3.addmm_(out.t(), second.view(out.shape[0], -1))
-            d_second = _rectify_gradient(torch.mm(out, kernel_3).view(-1, channels), second)
-            d_b2 += d_second.sum(0)
-            d_pair.addmm_(rows.t(), d_second)
-            d_third.addmm_(rows[1:, :channels].t(), d_second[:-1])
-            d_rows = torch.mm(d_second, pair.t())
-            d_rows[1:, :channels].addmm_(d_second[:-1], third.t())
-            d_first = _rectify_gradient(d_rows.view(-1, channels), first)
-            d_kernel_1.addmm_(_windows(bins[start : start + block_size], taps, runs).t(), d_first)
-        d_w1, d_b1 = d_kernel_1[:taps].t().reshape(shape_1), d_kernel_1[taps]
-        d_w2 = torch.cat((d_pair.view(2, channels, channels), d_third.unsqueeze(0))).permute(2, 1, 0)
-        d_b3 = gradient.sum(0)
+        d_features, *d_vectors = gradient.split(ctx.widths, dim=1)
+        d_b3, *d_biases = gradient.sum(0).split(ctx.widths)
+        d_w1, d_b1, d_b2 = bins.new_zeros(w1.shape[2], channels), torch.zeros_like(b1), torch.zeros_like(b1)
+        d_kernel, d_heard = torch.zeros_like(kernel), torch.zeros_like(heard)
+        windows = _window_buffer(bins, positions, kernel)
+        d_windows = torch.empty_like(windows)
+        for rows, block in _blocks(len(bins), len(positions)):
+            window, d_window = windows[: rows.stop - rows.start], d_windows[: rows.stop - rows.start]
+            d_heard.addmm_(d_features[block].t(), activations[rows].view(-1, heard.shape[1]))
+            d_rows = torch.mm(d_features[block], heard).view(-1, channels)
+            torch.ops.aten.threshold_backward.grad_input(d_rows, activations[rows], 0, grad_input=d_rows)
+            d_b2 += d_rows.sum(0)
+            _first_layer(bins[block].numpy(), positions, taps, b1.numpy(), window.numpy())
+            d_kernel.addmm_(window.t(), d_rows)
+            torch.mm(d_rows, kernel.t(), out=d_window)
+            arrays = window.numpy(), d_window.numpy(), d_w1.numpy(), d_b1.numpy()
+            _first_layer_gradient(bins[block].numpy(), positions, *arrays)
         # What the silent positions add to the linear layer's bias, backwards.
-        d_w3 = torch.outer(d_b3, silent_2).unsqueeze(1).expand(shape_3).contiguous()
-        d_silent_2 = _rectify_gradient(d_b3 @ silent_3, silent_2)
-        d_silent_1 = _rectify_gradient(d_silent_2 @ w2.sum(-1), silent_1)
-        row = 0
-        for a, b in runs:
-            d_w3[:, a:b] = d_kernel_3.view(shape_3[0], -1, channels)[:, row : row + b - a]
-            row += b - a + 1
-        d_w2 = d_w2 + torch.outer(d_silent_2, silent_1).unsqueeze(-1)
-        return None, d_w1, d_b1 + d_silent_1, d_w2, d_b2 + d_silent_2, d_w3.flatten(1), d_b3, None
+        d_silent_2 = (silent.t() @ d_b3).mul_(silent_2 > 0)
+        d_silent_1 = (kernel @ d_silent_2).view(_SEEN, channels).sum(0).mul_(silent_1 > 0)
+        d_kernel.addr_(silent_1.repeat(_SEEN), d_silent_2)
+        d_w3 = bins.new_empty(ctx.shape_3)
+        d_by_position, d_heard = d_w3.view(len(d_b3), -1, channels), d_heard.view(len(d_b3), -1, channels)
+        _unite(d_by_position.numpy(), positions, d_heard.numpy(), d_b3.numpy(), silent_2.numpy())
+        d_w2 = d_kernel.view(_SEEN, channels, channels).permute(2, 1, 0)
+        d_others = [
+            value
+            for d_vector, vector, d_bias in zip(d_vectors, vectors, d_biases, strict=True)
+            for value in (torch.mm(d_vector.t(), vector), d_bias)
+        ]
+        d_w1 = d_w1.t().reshape(w1.shape)
+        return None, None, d_w1, d_b1 + d_silent_1, d_w2, d_b2 + d_silent_2, d_w3, d_b3, *d_others
 
 
-def _block_size(runs: list[tuple[int, int]]) -> int:
-    """Return how many observations go through the layers together."""
-    return max(1, _ROWS_PER_BLOCK // sum(b - a + 1 for a, b in runs))
+def _divided(w3: Tensor, positions: np.ndarray, channels: int) -> tuple[Tensor, Tensor]:
+    """Return the linear layer's weight at the heard positions, and its sum over the silent ones."""
+    by_position = w3.detach().view(len(w3), -1, channels)
+    heard = w3.new_empty(len(w3), len(positions), channels)
+    silent = w3.new_empty(len(w3), channels)
+    _divide(by_position.numpy(), positions, heard.numpy(), silent.numpy())
+    return heard.flatten(1), silent
 
 
-def _windows(block: Tensor, taps: int, runs: list[tuple[int, int]]) -> Tensor:
-    """Return the windows of the first convolution that the runs need, a 1 appended, ``[n * positions, taps + 1]``."""
-    windows = block.new_ones(block.shape[0], 2 * sum(b - a + 1 for a, b in runs), taps + 1)
-    every, position = block.unfold(-1, taps, 2), 0
-    for a, b in runs:
-        number = 2 * (b - a + 1)
-        windows[:, position : position + number, :taps] = every[:, 2 * a : 2 * a + number]
-        position += number
-    return windows.view(-1, taps + 1)
+def _blocks(observations: int, positions: int) -> list[tuple[slice, slice]]:
+    """Cut the observations into blocks; return the rows and the observations of each."""
+    size = max(1, _ROWS_PER_BLOCK // positions)
+    starts = range(0, observations, size)
+    blocks = [slice(start, min(start + size, observations)) for start in starts]
+    return [(slice(block.start * positions, block.stop * positions), block) for block in blocks]
 
 
-def _heard(bins: Tensor, taps: int) -> list[tuple[int, int]]:
-    """Return the runs [a, b) of the second convolution's positions that see a bin which is not 0 in all the batch."""
-    first = (bins != 0).any(0).unfold(0, taps, 2).any(-1)
-    positions = first.unfold(0, 3, 2).any(-1).nonzero().flatten().tolist()
-    runs: list[tuple[int, int]] = []
-    for position in positions:
-        # A gap of one position costs no less than the position.
-        if runs and position <= runs[-1][1] + 1:
-            runs[-1] = (runs[-1][0], position + 1)
-        else:
-            runs.append((position, position + 1))
-    return runs or [(0, 1)]
+def _window_buffer(bins: Tensor, positions: np.ndarray, kernel: Tensor) -> Tensor:
+    """Return room for a block's windows."""
+    rows = _blocks(len(bins), len(positions))[0][0]
+    return bins.new_empty(rows.stop, len(kernel))
 
 
-def range_features(bins: Tensor, conv_1: nn.Conv1d, conv_2: nn.Conv1d, linear: nn.Linear) -> Tensor:
-    """Return the rectified ``linear(conv_2(conv_1(bins)))`` with rectifiers between, ``[n, features]``.
+def observation_features(
+    bins: Tensor,
+    vectors: Sequence[Tensor],
+    range_layers: tuple[nn.Conv1d, nn.Conv1d, nn.Linear],
+    vector_layers: Sequence[nn.Linear],
+) -> Tensor:
+    """Return the rectified layers' outputs side by side, those of the bins first, ``[n, features]``.
 
     Bins that are 0 in the whole batch cost nothing where their windows hold no other: a narrow sensor's do.
 
     Args:
-        bins: ``[n, bins]``; data, so no gradient flows to it.
-        conv_1: kernel 5 (any), stride 2, one input channel; its number of output positions must be even.
-        conv_2: kernel 3, stride 2.
-        linear: reads the positions of ``conv_2``, position by position.
+        bins: ``[n, bins]``, at least one; data, so no gradient flows to them, nor to the vectors.
+        vectors: ``[n, size]`` each.
+        range_layers: a convolution of kernel 5 and stride 2 with one input channel, one of kernel 3 and stride
+            2, and a linear layer that reads the positions of the second, position by position; rectifiers between.
+        vector_layers: a linear layer for each vector.
     """
-    runs = _heard(bins, conv_1.kernel_size[0])
-    return _RangeFeatures.apply(
-        bins, conv_1.weight, conv_1.bias, conv_2.weight, conv_2.bias, linear.weight, linear.bias, runs
-    )
+    parameters = [p for layer in (*range_layers, *vector_layers) for p in (layer.weight, layer.bias)]
+    vectors = [vector.contiguous() for vector in vectors]
+    return _ObservationFeatures.apply(bins.contiguous(), vectors, *parameters)

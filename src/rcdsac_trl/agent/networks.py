@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rcdsac_trl.agent.kernels import range_features
+from rcdsac_trl.agent.kernels import observation_features
 from rcdsac_trl.agent.quantile_kernels import quantile_values
 from rcdsac_trl.agent.recurrent_kernels import gated_recurrence
 from rcdsac_trl.agent.risk import RiskMeasure
@@ -97,7 +97,7 @@ class RangeFeatures(nn.Module):
         """Map ``[n, 180]`` to ``[n, features]``; no gradient flows to the bins."""
         if not _runs_kernels(bins) or len(bins) < FEW_OBSERVATIONS:
             return self.layers(bins)
-        return range_features(bins, self.conv_1, self.conv_2, self.linear)
+        return observation_features(bins, [], (self.conv_1, self.conv_2, self.linear), [])
 
     def layers(self, bins: Tensor) -> Tensor:
         """Compute the same with the layers one by one."""
