@@ -78,8 +78,8 @@ def test_silent_bins_are_left_out() -> None:
 
 @pytest.mark.parametrize(("rows", "steps"), [(1, 1), (1, 4), (3, 1), (5, 6)])
 def test_gated_recurrence_equals_torchs(rows: int, steps: int) -> None:
-    gru = nn.GRU(7, 5, batch_first=True).double()
-    inputs = torch.randn(rows, steps, 7, dtype=torch.float64, requires_grad=True)
+    gru = nn.GRU(7, 5).double()
+    inputs = torch.randn(steps, rows, 7, dtype=torch.float64, requires_grad=True)
     fast, plain = gated_recurrence(inputs, gru), gru(inputs)[0]
     torch.testing.assert_close(fast, plain)
     learned = [inputs, *gru.parameters()]
@@ -87,15 +87,15 @@ def test_gated_recurrence_equals_torchs(rows: int, steps: int) -> None:
 
 
 def test_gated_recurrence_against_finite_differences() -> None:
-    gru = nn.GRU(3, 2, batch_first=True).double()
-    inputs = torch.randn(2, 3, 3, dtype=torch.float64, requires_grad=True)
+    gru = nn.GRU(3, 2).double()
+    inputs = torch.randn(3, 2, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(_GatedRecurrence.apply, (inputs, *gru.parameters()))
 
 
 def quantile_head(steps: int, tau_steps: int, risk_steps: int, *, frozen: bool) -> tuple[QuantileHead, list[Tensor]]:
     """Make a head and its kernel's inputs: features, fractions, beta's part of the gate."""
     head = QuantileHead(2, SMALL, PowerLaw()).double().requires_grad_(not frozen)
-    sequences = 1 + quantile_kernels._ROWS_PER_BLOCK // (4 * steps)  # more than a block
+    sequences = 1 + quantile_kernels._ROWS_PER_BLOCK // (4 * steps)  # more than a block of products
     x = torch.randn(sequences, steps, SMALL.head, dtype=torch.float64, requires_grad=True)
     tau = torch.rand(sequences, tau_steps, 4, dtype=torch.float64)
     beta = torch.randn(sequences, risk_steps, SMALL.head, dtype=torch.float64, requires_grad=not frozen)

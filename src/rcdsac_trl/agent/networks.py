@@ -97,7 +97,12 @@ class RangeFeatures(nn.Module):
         """Map ``[n, 180]`` to ``[n, features]``; no gradient flows to the bins."""
         if not _runs_kernels(bins) or len(bins) < FEW_OBSERVATIONS:
             return self.layers(bins)
-        return observation_features(bins, [], (self.conv_1, self.conv_2, self.linear), [])
+        return observation_features(bins, [], self.stack, [])
+
+    @property
+    def stack(self) -> tuple[nn.Conv1d, nn.Conv1d, nn.Linear]:
+        """The layers in their order."""
+        return self.conv_1, self.conv_2, self.linear
 
     def layers(self, bins: Tensor) -> Tensor:
         """Compute the same with the layers one by one."""
@@ -129,10 +134,13 @@ class Encoder(nn.Module):
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
         """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
-        features = self._features(range_, vectors)
-        if _runs_kernels(features) and torch.is_grad_enabled():
-            return gated_recurrence(features, self.gru)
-        return self.gru(features)[0]
+        if not _runs_kernels(range_) or range_.shape[:2].numel() < FEW_OBSERVATIONS:
+            return self.gru(self._features(range_, vectors))[0]
+        sequences, steps = range_.shape[:2]
+        # Step after step, as the recurrence reads them.
+        bins, *vectors = (value.transpose(0, 1).reshape(sequences * steps, -1) for value in (range_, *vectors))
+        features = observation_features(bins, vectors, self.range.stack, self.vectors)
+        return gated_recurrence(features.view(steps, sequences, -1), self.gru).transpose(0, 1)
 
     def step(self, range_: Tensor, *rest: Tensor) -> Tensor:
         """Advance any batch ``[*]`` of agents by one observation.

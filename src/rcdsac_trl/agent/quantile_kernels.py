@@ -24,7 +24,11 @@ _ROWS_PER_BLOCK = 1024
 
 
 # ------------------------------------------------------------------------------------------------ compiled passes
-@numba.njit(cache=True, error_model="numpy")
+# A sum over features may be added up in any order, which lets several be added at once.
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"})
+
+
+@_compiled
 def _multiply(x: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, product: np.ndarray) -> None:
     """Write ``x * relu(tau_gate + beta)``, broadcast over steps and quantiles."""
     zero = x.dtype.type(0)
@@ -38,28 +42,42 @@ def _multiply(x: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, product: np
                     out[h] = features[h] * max(gate[h] + offset[h], zero)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _rectify(hidden: np.ndarray, bias: np.ndarray) -> None:
-    """Add the bias to every row and rectify, in place."""
+@_compiled
+def _output(hidden: np.ndarray, bias: np.ndarray, weight: np.ndarray, out_bias: np.ndarray, values: np.ndarray) -> None:
+    """Add the bias to hidden and rectify it, in place, and write its product with the output layer."""
     zero = hidden.dtype.type(0)
     for r in range(hidden.shape[0]):
-        row = hidden[r]
+        row, total = hidden[r], out_bias[0]
         for h in range(row.size):
             row[h] = max(row[h] + bias[h], zero)
+            total += row[h] * weight[h]
+        values[r] = total
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _masked(out: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray) -> None:
+@_compiled
+def _hidden_gradient(slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray) -> None:
     """Write the output's gradient where hidden is active."""
     zero = hidden.dtype.type(0)
     for r in range(hidden.shape[0]):
-        row, d_row, slope = hidden[r], d_hidden[r], out[r]
+        row, d_row, slope = hidden[r], d_hidden[r], slopes[r]
         for h in range(row.size):
             d_row[h] = slope if row[h] > zero else zero
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _multiply_gradient(d_product: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, d_x: np.ndarray) -> None:
+@_compiled
+def _output_gradient(
+    slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray, d_bias: np.ndarray, d_weight: np.ndarray
+) -> None:
+    """Add the gradients of hidden's bias and of the output's weight."""
+    for r in range(hidden.shape[0]):
+        row, d_row, slope = hidden[r], d_hidden[r], slopes[r]
+        for h in range(row.size):
+            d_bias[h] += d_row[h]
+            d_weight[h] += slope * row[h]
+
+
+@_compiled
+def _features_gradient(d_product: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, d_x: np.ndarray) -> None:
     """Add the gradient of x: the product's, times the gate."""
     zero = d_x.dtype.type(0)
     for s in range(d_x.shape[0]):
@@ -72,30 +90,34 @@ def _multiply_gradient(d_product: np.ndarray, tau_gate: np.ndarray, beta: np.nda
                     d_features[h] += d_out[h] * max(gate[h] + offset[h], zero)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _gate_gradient(
-    d_product: np.ndarray,
+@_compiled
+def _product_gradient(
+    product: np.ndarray,
     x: np.ndarray,
     tau_gate: np.ndarray,
     beta: np.ndarray,
+    d_x: np.ndarray,
     d_tau_gate: np.ndarray,
     d_beta: np.ndarray,
 ) -> None:
-    """Add the gradients of both halves of the gate: the product's times x, where the gate is open."""
+    """Add the gradients of x and of both halves of the gate; turn the product's gradient into the product."""
     zero = x.dtype.type(0)
     for s in range(x.shape[0]):
         for t in range(x.shape[1]):
-            features, at_beta, at_tau = x[s, t], min(t, beta.shape[1] - 1), min(t, tau_gate.shape[1] - 1)
-            offset, d_offset = beta[s, at_beta], d_beta[s, at_beta]
+            at_beta, at_tau = min(t, beta.shape[1] - 1), min(t, tau_gate.shape[1] - 1)
+            features, d_features, offset, d_offset = x[s, t], d_x[s, t], beta[s, at_beta], d_beta[s, at_beta]
             for n in range(tau_gate.shape[2]):
-                gate, d_gate, d_out = tau_gate[s, at_tau, n], d_tau_gate[s, at_tau, n], d_product[s, t, n]
-                for h in range(d_out.size):
-                    change = d_out[h] * features[h] if gate[h] + offset[h] > zero else zero
+                gate, d_gate, out = tau_gate[s, at_tau, n], d_tau_gate[s, at_tau, n], product[s, t, n]
+                for h in range(out.size):
+                    opened = max(gate[h] + offset[h], zero)
+                    change = out[h] * features[h] if opened > zero else zero
+                    d_features[h] += out[h] * opened
                     d_gate[h] += change
                     d_offset[h] += change
+                    out[h] = features[h] * opened
 
 
-@numba.njit(cache=True, error_model="numpy")
+@_compiled
 def _huber(
     quantiles: np.ndarray, targets: np.ndarray, tau: np.ndarray, kappa: float, errors: np.ndarray, slopes: np.ndarray
 ) -> None:
@@ -115,7 +137,11 @@ def _huber(
 
 # ------------------------------------------------------------------------------------------------ quantile values
 class _QuantileValues(torch.autograd.Function):
-    """``output(relu(hidden(x * relu(gate(cos(frequencies * tau)) + beta))))``."""
+    """``output(relu(hidden(x * relu(gate(cos(frequencies * tau)) + beta))))``.
+
+    Gates are computed for some sequences at a time, and multiplied with their features for fewer: along a sequence
+    that shares its fractions there are far more products than gates.
+    """
 
     @staticmethod
     def forward(
@@ -131,50 +157,59 @@ class _QuantileValues(torch.autograd.Function):
         out_weight: Tensor,
         out_bias: Tensor,
     ) -> Tensor:
-        sequences, steps, number = x.shape[0], x.shape[1], tau.shape[-1]
-        result = x.new_empty(sequences, steps, number)
+        (sequences, steps, size), number = x.shape, tau.shape[-1]
+        result, keep = x.new_empty(sequences, steps, number), any(ctx.needs_input_grad)
         saved: list[Tensor] = []
-        for part in _blocks(sequences, steps * number):
-            cosines = torch.cos(tau[part].unsqueeze(-1) * frequencies).flatten(0, -2)
-            tau_gate = torch.addmm(gate_bias, cosines, gate_weight.t()).view(*tau[part].shape, -1)
-            product = _product(x[part], tau_gate, beta[part])
-            hidden = torch.mm(product, weight.t())
-            _rectify(hidden.numpy(), bias.numpy())
-            torch.addmv(out_bias, hidden, out_weight.view(-1), out=result[part].view(-1))
-            if any(ctx.needs_input_grad):
-                saved += [cosines, tau_gate, hidden]
-        ctx.save_for_backward(x, beta, gate_weight, weight, out_weight, *saved)
+        transposed, buffer = weight.t(), _Buffer(x, steps * number)
+        for gated in _blocks(range(sequences), tau[0].numel()):
+            cosines = torch.cos(tau[gated].unsqueeze(-1) * frequencies).flatten(0, -2)
+            tau_gate = torch.addmm(gate_bias, cosines, gate_weight.t()).view(*tau[gated].shape, size)
+            saved += [cosines, tau_gate] if keep else []
+            for part in _blocks(range(sequences)[gated], steps * number):
+                product = buffer.rows(part)
+                gates = tau_gate[part.start - gated.start : part.stop - gated.start]
+                _multiply(x[part].numpy(), gates.numpy(), beta[part].numpy(), product.numpy())
+                hidden = torch.mm(product.flatten(0, -2), transposed)
+                parameters = bias.numpy(), out_weight.view(-1).numpy(), out_bias.numpy()
+                _output(hidden.numpy(), *parameters, result[part].view(-1).numpy())
+                saved += [hidden] if keep else []
+        ctx.save_for_backward(x, tau, beta, gate_weight, weight, out_weight, *saved)
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        x, beta, gate_weight, weight, out_weight, *saved = ctx.saved_tensors
+        x, tau, beta, gate_weight, weight, out_weight, *saved = ctx.saved_tensors
         need_parameters = ctx.needs_input_grad[6]
+        (sequences, steps, number), left = gradient.shape, iter(saved)
         d_x, d_beta = torch.zeros_like(x), torch.zeros_like(beta)
-        d_gate_weight, d_gate_bias = torch.zeros_like(gate_weight), x.new_zeros(gate_weight.shape[0])
-        d_weight, d_bias = torch.zeros_like(weight), x.new_zeros(weight.shape[0])
-        d_out_weight = x.new_zeros(weight.shape[0])
+        d_gate_weight, d_gate_bias = torch.zeros_like(gate_weight), x.new_zeros(len(gate_weight))
+        d_weight, d_bias, d_out_weight = torch.zeros_like(weight), x.new_zeros(len(weight)), x.new_zeros(len(weight))
         gradient = gradient.contiguous()
         # The output layer's weight is the same for every row: it goes into the matrices instead of the rows.
         slopes = out_weight.view(-1, 1)
-        through = weight * slopes
-        for index, part in enumerate(_blocks(gradient.shape[0], gradient[0].numel())):
-            cosines, tau_gate, hidden = saved[3 * index : 3 * index + 3]
-            out, d_hidden = gradient[part].view(-1), torch.empty_like(hidden)
-            _masked(out.numpy(), hidden.numpy(), d_hidden.numpy())
-            d_product = torch.mm(d_hidden, through).view(*gradient[part].shape, -1)
-            _multiply_gradient(d_product.numpy(), tau_gate.numpy(), beta[part].numpy(), d_x[part].numpy())
+        through, buffer, d_buffer = weight * slopes, _Buffer(x, steps * number), _Buffer(x, steps * number)
+        for gated in _blocks(range(sequences), tau[0].numel()):
+            cosines, tau_gate = next(left), next(left)
+            d_tau_gate = torch.zeros_like(tau_gate) if need_parameters else tau_gate
+            for part in _blocks(range(sequences)[gated], steps * number):
+                hidden, out = next(left), gradient[part].view(-1).numpy()
+                product, d_hidden = buffer.rows(part), d_buffer.rows(part).view_as(hidden)
+                _hidden_gradient(out, hidden.numpy(), d_hidden.numpy())
+                torch.mm(d_hidden, through, out=product.view(len(hidden), -1))
+                among = slice(part.start - gated.start, part.stop - gated.start)
+                gates = tau_gate[among].numpy(), beta[part].numpy(), d_x[part].numpy()
+                if not need_parameters:
+                    _features_gradient(product.numpy(), *gates)
+                    continue
+                _output_gradient(out, hidden.numpy(), d_hidden.numpy(), d_bias.numpy(), d_out_weight.numpy())
+                d_gates = d_tau_gate[among].numpy(), d_beta[part].numpy()
+                _product_gradient(product.numpy(), x[part].numpy(), *gates, *d_gates)
+                d_weight.addmm_(d_hidden.t(), product.view(len(hidden), -1))
             if need_parameters:
-                d_weight.addmm_(d_hidden.t(), _product(x[part], tau_gate, beta[part]))
-                d_bias += d_hidden.sum(0)
-                d_out_weight.addmv_(hidden.t(), out)
-                d_gate = torch.zeros_like(tau_gate)
-                gates = tau_gate.numpy(), beta[part].numpy(), d_gate.numpy(), d_beta[part].numpy()
-                _gate_gradient(d_product.numpy(), x[part].numpy(), *gates)
-                d_gate = d_gate.flatten(0, -2)
-                d_gate_weight.addmm_(d_gate.t(), cosines)
-                d_gate_bias += d_gate.sum(0)
+                d_tau_gate = d_tau_gate.flatten(0, -2)
+                d_gate_weight.addmm_(d_tau_gate.t(), cosines)
+                d_gate_bias += d_tau_gate.sum(0)
         if not need_parameters:
             return (d_x, *[None] * 9)
         d_weight, d_bias = d_weight.mul_(slopes), d_bias.mul_(slopes.view(-1))
@@ -182,17 +217,27 @@ class _QuantileValues(torch.autograd.Function):
         return d_x, None, d_beta, None, d_gate_weight, d_gate_bias, d_weight, d_bias, *d_output
 
 
-def _blocks(sequences: int, rows: int) -> list[slice]:
+def _blocks(sequences: range, rows: int) -> list[slice]:
     """Cut the sequences of so many rows each into blocks."""
     size = max(1, _ROWS_PER_BLOCK // rows)
-    return [slice(start, start + size) for start in range(0, sequences, size)]
+    starts = range(sequences.start, sequences.stop, size)
+    return [slice(start, min(start + size, sequences.stop)) for start in starts]
 
 
-def _product(x: Tensor, tau_gate: Tensor, beta: Tensor) -> Tensor:
-    """Return ``x * relu(tau_gate + beta)``, a row a quantile."""
-    product = x.new_empty(x.shape[0], x.shape[1], *tau_gate.shape[2:])
-    _multiply(x.numpy(), tau_gate.numpy(), beta.numpy(), product.numpy())
-    return product.flatten(0, -2)
+class _Buffer:
+    """Room for the products of a block ``[sequences, steps, quantiles, size]``, the same for all blocks.
+
+    Args:
+        x: features ``[B, L, H]``.
+        rows: of a sequence.
+    """
+
+    def __init__(self, x: Tensor, rows: int) -> None:
+        self._data = x.new_empty(_blocks(range(len(x)), rows)[0].stop, x.shape[1], rows // x.shape[1], x.shape[2])
+
+    def rows(self, part: slice) -> Tensor:
+        """Return the room for these sequences."""
+        return self._data[: part.stop - part.start]
 
 
 def quantile_values(

@@ -3,11 +3,11 @@ r"""A gated recurrent layer that learns, on a CPU, its backward pass written out
 It computes exactly what ``nn.GRU`` does (tests hold it against that, and against finite differences). Torch's own layer
 records some twenty operations a step for its backward pass, among them a matrix product for every weight. Here a step
 back is one compiled pass and one matrix product, and whatever does not wait for another step is one matrix product
-over all of them. Without gradients, torch's own layer is as fast.
+over all of them.
 
 Public names::
 
-    gated_recurrence(inputs [B,T,I], gru) -> [B,T,H]
+    gated_recurrence(inputs [T,B,I], gru) -> [T,B,H]
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _step_gradient(
     t: int,
     gradient: np.ndarray,
@@ -35,7 +35,7 @@ def _step_gradient(
     size = states.shape[2]
     for b in range(states.shape[1]):
         gate, before = gates[t, b], states[t, b]
-        hidden, out, d_h = recurrent[t, b], gradient[b, t], carried[b]
+        hidden, out, d_h = recurrent[t, b], gradient[t, b], carried[b]
         d_in, d_re = d_inputs[t, b], d_recurrent[t, b]
         for i in range(size):
             r, z, n = gate[i], gate[size + i], gate[2 * size + i]
@@ -53,16 +53,16 @@ def _step_gradient(
 
 
 class _GatedRecurrence(torch.autograd.Function):
-    """``h' = n + z (h - n)``, ``n = tanh(W_n x + b + r (U_n h + c))``; time first inside, batch first outside."""
+    """``h' = n + z (h - n)``, ``n = tanh(W_n x + b + r (U_n h + c))``; time comes first."""
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, w_in: Tensor, w_re: Tensor, b_in: Tensor, b_re: Tensor) -> Tensor:
-        rows, steps, size = inputs.shape[0], inputs.shape[1], w_re.shape[1]
-        x = inputs.transpose(0, 1).reshape(steps * rows, -1)
+        steps, rows, size = inputs.shape[0], inputs.shape[1], w_re.shape[1]
+        x = inputs.reshape(steps * rows, -1)
         gates = torch.addmm(b_in, x, w_in.t()).view(steps, rows, 3 * size)  # r, z, n; first of the inputs alone
         states = inputs.new_empty(steps + 1, rows, size)
         states[0].zero_()
-        recurrent, weight = torch.empty_like(gates), w_re.t()
+        recurrent, weight = torch.empty_like(gates), w_re.t().contiguous()
         columns = (*gates.split(size, dim=-1), gates[..., : 2 * size], recurrent)
         columns = (*columns, *recurrent.split((2 * size, size), dim=-1), states[:-1], states[1:])
         for r, z, n, both, product, product_both, product_n, before, after in zip(
@@ -73,7 +73,7 @@ class _GatedRecurrence(torch.autograd.Function):
             n.addcmul_(r, product_n).tanh_()
             torch.lerp(n, before, z, out=after)
         ctx.save_for_backward(x, w_in, w_re, gates, recurrent, states)
-        return states[1:].transpose(0, 1)
+        return states[1:]
 
     @staticmethod
     @once_differentiable
@@ -89,17 +89,17 @@ class _GatedRecurrence(torch.autograd.Function):
             if t > 0:
                 carried.addmm_(d_recurrent[t], w_re)
         d_inputs, d_recurrent = d_inputs.view(-1, 3 * size), d_recurrent.view(-1, 3 * size)
-        d_x = torch.mm(d_inputs, w_in).view(steps, rows, -1).transpose(0, 1)
+        d_x = torch.mm(d_inputs, w_in).view(steps, rows, -1)
         d_w_in = torch.mm(d_inputs.t(), x)
         d_w_re = torch.mm(d_recurrent[rows:].t(), states[1:-1].reshape(-1, size))
         return d_x, d_w_in, d_w_re, d_inputs.sum(0), d_recurrent.sum(0)
 
 
 def gated_recurrence(inputs: Tensor, gru: nn.GRU) -> Tensor:
-    """Return the states of a one-layer, batch-first ``nn.GRU`` that starts at zero, ``[B, T, H]``.
+    """Return the states of a one-layer ``nn.GRU`` that starts at zero, ``[T, B, H]``.
 
     Args:
-        inputs: ``[B, T, I]``.
+        inputs: time first, ``[T, B, I]``.
         gru: gives the weights.
     """
     return _GatedRecurrence.apply(inputs, gru.weight_ih_l0, gru.weight_hh_l0, gru.bias_ih_l0, gru.bias_hh_l0)
