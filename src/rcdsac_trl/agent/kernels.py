@@ -238,7 +238,7 @@ def observation_features(
     bins: Tensor,
     vectors: Sequence[Tensor],
     range_layers: tuple[nn.Conv1d, nn.Conv1d, nn.Linear],
-    vector_layers: Sequence[nn.Linear],
+    vector_layers: Sequence[nn.Module],
 ) -> Tensor:
     """Return the rectified layers' outputs side by side, those of the bins first, ``[n, features]``.
 

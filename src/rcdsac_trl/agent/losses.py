@@ -14,18 +14,15 @@ Public names::
         loss.log_alpha
 """
 
-import copy
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
-from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import (
     ValueEstimators,
     _reduce,
@@ -34,13 +31,14 @@ from torchrl.objectives.utils import (
 )
 
 from rcdsac_trl.agent.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
+from rcdsac_trl.agent.linked_loss import LinkedLoss, frozen
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
 
 #: What a target can take of the target critics.
 OVER_CRITICS: dict[str, Callable[[list[Tensor]], Tensor]] = {"minimum": minimum, "smaller": smaller, "mean": mean}
 
 
-class DistributionalSACLoss(LossModule):
+class DistributionalSACLoss(LinkedLoss):
     r"""Soft actor-critic whose critics are the quantile function of the return, or its mean.
 
     With quantile critics it is RC-DSAC (networks conditioned on ``risk``) or DSAC (networks not conditioned); with
@@ -130,13 +128,6 @@ class DistributionalSACLoss(LossModule):
     default_value_estimator = ValueEstimators.TD0
     SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
 
-    actor_network: TensorDictSequential
-    critic_network: nn.ModuleList
-    actor_network_params: TensorDictParams
-    critic_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
-    target_critic_network_params: TensorDictParams
-
     def __init__(
         self,
         actor: TensorDictSequential,
@@ -178,13 +169,7 @@ class DistributionalSACLoss(LossModule):
         if self._distributional and measure is None:
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
 
-        self.convert_to_functional(actor, "actor_network")
-        # One functional module for all critics: their parameters keep apart (a list given to TorchRL's own
-        # conversion is stacked, which a recurrent layer without vmap cannot use).
-        self.convert_to_functional(nn.ModuleList(critics), "critic_network", create_target_params=True)
-        # In a tuple, so that their parameters are not listed as this module's own a second time.
-        self._target_critics = tuple(copy.deepcopy(critic) for critic in critics)
-        self._link()
+        self._link_networks(actor, critics)
         self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
         self.measure = measure or Neutral()
         self.num_quantiles = num_quantiles
@@ -238,23 +223,6 @@ class DistributionalSACLoss(LossModule):
         return [*keys, "quantile_spread"] if self._distributional else keys
 
     @property
-    def rng_state(self) -> Tensor:
-        """State of the generator that all random numbers of the loss come from."""
-        return self._generator.get_state()
-
-    @rng_state.setter
-    def rng_state(self, state: Tensor) -> None:
-        self._generator.set_state(state)
-
-    def get_extra_state(self) -> Tensor:
-        """Put the generator's state into ``state_dict``."""
-        return self.rng_state
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Take the generator's state from ``state_dict``."""
-        self.rng_state = state
-
-    @property
     def _distributional(self) -> bool:
         return self.tensor_keys.tau in self._critics[0][1].in_keys
 
@@ -262,29 +230,6 @@ class DistributionalSACLoss(LossModule):
     def alpha(self) -> Tensor:
         """The temperature, detached."""
         return self.log_alpha.detach().exp()
-
-    def _link(self) -> None:
-        """Let the modules hold the loss's parameters for good, the target critics those of the targets.
-
-        TorchRL's idiom lends a module its parameters for every call; with recurrent networks of small batches, that
-        costs more than some of their layers. Whatever makes new tensors calls this again.
-        """
-        self.actor_network_params.to_module(self.actor_network)
-        self.critic_network_params.to_module(self.critic_network)
-        params = self._modules["target_critic_network_params"]  # the attribute warns before there is an updater
-        params.to_module(nn.ModuleList(self._target_critics))
-        self._head_parameters = tuple(p for critic in self._critics for p in critic[1].parameters() if p.requires_grad)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "DistributionalSACLoss":
-        """Move or cast the parameters, as :meth:`torch.nn.Module.to` does."""
-        super()._apply(fn)
-        self._link()
-        return self
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of a copied or pickled loss."""
-        super().__setstate__(state)
-        self._link()
 
     # ------------------------------------------------------------------------------------------- the losses
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -372,7 +317,7 @@ class DistributionalSACLoss(LossModule):
         tau = self._fractions(self.num_risk_samples, log_prob)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
-        with _frozen(self._head_parameters):
+        with frozen(self._head_parameters):
             values = [
                 self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
                 for critic, memory in zip(self._critics, critic_memories, strict=True)
@@ -430,15 +375,3 @@ class DistributionalSACLoss(LossModule):
             if self._distributional:
                 diagnostics["quantile_spread"] = stacked.std(-1, correction=0).mean(0)
             return diagnostics
-
-
-@contextmanager
-def _frozen(parameters: tuple[nn.Parameter, ...]) -> Iterator[None]:
-    """Let no gradient flow to the parameters from what is computed within a block."""
-    for parameter in parameters:
-        parameter.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for parameter in parameters:
-            parameter.requires_grad_(True)

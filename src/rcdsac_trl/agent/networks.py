@@ -138,8 +138,8 @@ class Encoder(nn.Module):
             return self.gru(self._features(range_, vectors))[0]
         sequences, steps = range_.shape[:2]
         # Step after step, as the recurrence reads them.
-        bins, *vectors = (value.transpose(0, 1).reshape(sequences * steps, -1) for value in (range_, *vectors))
-        features = observation_features(bins, vectors, self.range.stack, self.vectors)
+        bins, *others = (value.transpose(0, 1).reshape(sequences * steps, -1) for value in (range_, *vectors))
+        features = observation_features(bins, others, self.range.stack, list(self.vectors))
         return gated_recurrence(features.view(steps, sequences, -1), self.gru).transpose(0, 1)
 
     def step(self, range_: Tensor, *rest: Tensor) -> Tensor:
