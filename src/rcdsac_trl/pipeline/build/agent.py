@@ -8,7 +8,7 @@ from torchrl.objectives import LossModule
 from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
 from rcdsac_trl.agent.losses import DistributionalSACLoss
 from rcdsac_trl.agent.transforms import Relabel
-from rcdsac_trl.pipeline.policies import LeanPolicy, OnDevice
+from rcdsac_trl.pipeline.policies import AgentNoise, LeanPolicy, OnDevice
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import LearnerSettings
 from rcdsac_trl.seeding import torch_seed, torch_stream
@@ -18,15 +18,12 @@ from rcdsac_trl.world.spaces import ACTION_SIZE
 def make_loss(settings: TrainingSettings, device: str) -> LossModule:
     """Make actor, critics and their loss, with weights from the stream ``"weights"``."""
     algo, learner, widths = settings.algo, settings.learner, settings.network
-    vectors = dict(OBSERVATIONS)
-    if algo.collision_weight is not None:
-        vectors["collision_weight"] = 1
     # Layers draw their first weights from torch's global generator: lend it our stream, and give it back.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(torch_seed(settings.seed, "weights"))
-        actor = build_actor(ACTION_SIZE, vectors, algo.network_measure, widths)
+        actor = _build_actor(settings)
         critics = [
-            build_critic(ACTION_SIZE, vectors, algo.critic, algo.network_measure, widths)
+            build_critic(ACTION_SIZE, _vectors(settings), algo.critic, algo.network_measure, widths)
             for _ in range(learner.num_critics)
         ]
     loss = DistributionalSACLoss(
@@ -48,15 +45,31 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
     return loss
 
 
+def _vectors(settings: TrainingSettings) -> dict[str, int]:
+    """Name the vector observations of the networks, and their sizes."""
+    weighted = settings.algo.collision_weight is not None
+    return OBSERVATIONS | ({"collision_weight": 1} if weighted else {})
+
+
+def _build_actor(settings: TrainingSettings) -> TensorDictSequential:
+    return build_actor(ACTION_SIZE, _vectors(settings), settings.algo.network_measure, settings.network)
+
+
+def make_actor(settings: TrainingSettings) -> TensorDictSequential:
+    """Make an actor on the CPU whose weights are yet to be loaded."""
+    with torch.random.fork_rng(devices=[]):  # it would draw first weights from torch's global generator
+        return _build_actor(settings)
+
+
 def make_average(loss: LossModule, learner: LearnerSettings) -> AveragedModel:
     """Make the running average of the actor's weights; it is what is validated, evaluated and deployed."""
     decay = learner.actor_average_decay
     return AveragedModel(loss.actor_network, multi_avg_fn=get_ema_multi_avg_fn(decay))
 
 
-def make_policy(actor: TensorDictSequential, generator: torch.Generator, device: str) -> TensorDictModuleBase:
+def make_policy(actor: TensorDictSequential, noise: AgentNoise, device: str) -> TensorDictModuleBase:
     """Make the acting policy of an actor; it shares the actor's weights."""
-    policy = LeanPolicy(actor, generator)
+    policy = LeanPolicy(actor, noise)
     return policy if device == "cpu" else OnDevice(policy, device)
 
 

@@ -9,15 +9,14 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.pipeline import runtime
-from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_policy
+from rcdsac_trl.pipeline.build.agent import make_actor, make_policy
 from rcdsac_trl.pipeline.build.world import evaluation_environment
 from rcdsac_trl.pipeline.drivers import Drive, Rows
 from rcdsac_trl.pipeline.evaluation import measure_map
 from rcdsac_trl.pipeline.metrics import Condition
-from rcdsac_trl.pipeline.policies import PursuitPolicy
+from rcdsac_trl.pipeline.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import WorldSettings
-from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.world.maps import Split
 
 
@@ -63,12 +62,12 @@ def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
     env = evaluation_environment(
         course.world, algo, course.conditions, course.split, course.seed, course.num_episodes, memory
     )
-    noise = torch.Generator(device=course.device)
+    noise = AgentNoise(range(len(course.conditions) * course.num_episodes))
     policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
 
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         # By the map's number, so that it does not matter which process drives it.
-        noise.manual_seed(torch_seed(course.seed, "evaluation actions", map_index))
+        noise.begin(course.seed, "evaluation actions", map_index)
         return measure_map(
             env,
             policy,
@@ -88,7 +87,7 @@ def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
         torch.set_num_threads(threads)
 
 
-def _policy(course: Course, actor: bytes, noise: torch.Generator) -> TensorDictModuleBase:
-    module = make_average(make_loss(course.trained, course.device), course.trained.learner).module
+def _policy(course: Course, actor: bytes, noise: AgentNoise) -> TensorDictModuleBase:
+    module = make_actor(course.trained)
     module.load_state_dict(safetensors.torch.load(actor))
-    return make_policy(module, noise, course.device)
+    return make_policy(module.to(course.device), noise, course.device)

@@ -32,7 +32,7 @@ from rcdsac_trl.pipeline.collection import Episodes
 from rcdsac_trl.pipeline.drivers import cores, resolve_processes_beside
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.guard import FiniteGuard, load_failure
-from rcdsac_trl.pipeline.policies import CollectionPolicy
+from rcdsac_trl.pipeline.policies import AgentNoise, CollectionPolicy
 from rcdsac_trl.pipeline.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
@@ -250,10 +250,10 @@ def _restore(folder: Path, checkpoints: Checkpoints, saved: Saved) -> tuple[Prog
 def _episodes(settings: TrainingSettings, loss: LossModule, device: str, progress: Progress) -> Episodes:
     """Make what collects the episodes of each iteration."""
     schedule, world = settings.schedule, settings.training_world
-    exploration = torch.Generator(device=device)
+    exploration = AgentNoise(range(world.num_agents))
     policy = CollectionPolicy(
         make_policy(loss.actor_network, exploration, device),
-        generator=exploration,
+        noise=exploration,
         seed=settings.seed,
         pursuit_iterations=schedule.pursuit_iterations,
         pursuit_noise=schedule.pursuit_noise,
