@@ -21,7 +21,7 @@ from rcdsac_trl.pipeline import build, drivers
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.replay import SequenceReplay
 from rcdsac_trl.pipeline.trainer import Learner
-from rcdsac_trl.world.env import NavigationEnv
+from rcdsac_trl.world.agents import AgentGroup
 from tiny import evaluate, tiny_trainer
 
 SAVING = [(os, "fsync"), (os, "rename"), (os, "truncate"), (os, "unlink"), (shutil, "rmtree")]
@@ -30,7 +30,7 @@ TRAINING = [
     (RunLog, "scalars"),
     (SequenceReplay, "add_episodes"),
     (Learner, "update"),
-    (NavigationEnv, "_step"),
+    (AgentGroup, "step"),
 ]
 
 

@@ -133,7 +133,16 @@ def refusal(
         ),
         ([POW, "logger.backends=csv"], "logger.backends=csv must be a list of words in brackets"),
         # what does not go together
-        ([POW, "world.num_agents=10", "world.num_workers=3"], "num_workers=3 cannot share 10 agents evenly"),
+        (
+            [POW, "collector=single", "world.num_agents=10", "world.num_workers=3"],
+            "num_workers=3 cannot share 10 agents evenly",
+        ),
+        ([POW, "world.num_workers=2"], "world.num_workers=2 does nothing with collector=multi: give collector.num_pro"),
+        (
+            [POW, "collector=single", "+collector.num_processes=2"],
+            "collector.num_processes=2 does nothing with collector=single: give world.num_workers",
+        ),
+        ([POW, "collector.num_processes=-1"], "collector.num_processes=-1 is not a number of processes"),
         ([POW, "world.num_agents=0"], "world.num_agents=0 is below 1"),
         ([POW, "task.episode_steps=5", "learner.sequence_length=6"], "learner.sequence_length=6 is longer than an epi"),
         (
@@ -344,8 +353,12 @@ def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "processes",
-    [["world.num_workers=2"], ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"]],
-    ids=["workers", "validation"],
+    [
+        ["collector=single", "world.num_workers=2"],
+        ["collector.num_processes=2"],
+        ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"],
+    ],
+    ids=["workers", "teams", "validation"],
 )
 def test_ctrl_c_with_processes(tmp_path: Path, processes: list[str]) -> None:
     code, err = interrupt(tmp_path, *processes)

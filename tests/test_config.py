@@ -130,7 +130,7 @@ def test_the_command_line_wins_over_the_preset() -> None:
     assert composed("+algo=rcdsac_pow", "schedule.iterations=7").schedule.iterations == 7
 
 
-@pytest.mark.parametrize("group", ["map", "sensor", "task", "preset"])
+@pytest.mark.parametrize("group", ["map", "sensor", "task", "collector", "preset"])
 def test_every_choice_of_a_group_is_readable(group: str) -> None:
     for name in choices(group):
         composed("+algo=rcdsac_pow", f"{group}={name}")
@@ -309,10 +309,11 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     # Together these rows, and a world with one of everything, use every part there is.
     world = ["map.clutter_per_m2=0.05", "map.mapped_fraction=0.5", "map.layouts=[mixed]", "map.num_movers=1"]
-    for row in ("rcdsac_pow", "dsac_cvar", "rcwr"):
+    for row, collector in (("rcdsac_pow", "multi"), ("dsac_cvar", "single"), ("rcwr", "multi")):
         tiny_trainer(
             tmp_path / row,
             row,
+            f"collector={collector}",
             *world,
             "schedule.iterations=1",
             "schedule.neutral_iterations=0",

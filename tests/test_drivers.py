@@ -135,7 +135,7 @@ def test_training_leaves_a_core_to_validation(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_no_more_processes_than_maps() -> None:
-    assert [resolve_processes(n, num_maps=3) for n in (0, 1, 2, 8)] == [0, 0, 2, 3]
+    assert [resolve_processes(n, 3) for n in (0, 1, 2, 8)] == [0, 0, 2, 3]
     for wrong in (-1, 1.5, "all"):
         with pytest.raises(UserInputError, match="is not a number of processes"):
             resolve_processes(wrong, 3)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -21,14 +22,15 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import build, evaluation
 from rcdsac_trl.pipeline.build import driver
 from rcdsac_trl.pipeline.build.agent import make_average, make_loss
-from rcdsac_trl.pipeline.build.world import evaluation_environment
+from rcdsac_trl.pipeline.build.world import environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, load_weights
 from rcdsac_trl.pipeline.cli import compose
-from rcdsac_trl.pipeline.evaluation import EvaluationRun, run_episodes
+from rcdsac_trl.pipeline.evaluation import EvaluationRun
 from rcdsac_trl.pipeline.metrics import METRICS, Condition
-from rcdsac_trl.pipeline.policies import PursuitPolicy
+from rcdsac_trl.pipeline.policies import LeanPolicy, PursuitPolicy
 from rcdsac_trl.pipeline.saved import Progress, load_progress
-from rcdsac_trl.pipeline.settings import WorldSettings
+from rcdsac_trl.pipeline.settings import AlgoSettings, WorldSettings
+from rcdsac_trl.pipeline.teams import Driven, Team
 from rcdsac_trl.pipeline.validation import Snapshot
 from rcdsac_trl.world.env import make_env
 from tiny import evaluate, tiny_settings, tiny_trainer
@@ -133,7 +135,7 @@ def test_nothing_is_written_when_it_is_stopped(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evaluation, "run_episodes", stop)
+    monkeypatch.setattr(evaluation, "episode_metrics", stop)
     with pytest.raises(KeyboardInterrupt):
         evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     assert not (tmp_path / "out").exists()
@@ -166,37 +168,27 @@ def test_fractions_and_counts_are_possible_numbers(run: Path, tmp_path: Path) ->
     assert episodes["mean_speed_m_per_s"].between(0, 0.7).all()
 
 
-class Hits(EnvBase):
-    """Every agent collides in its second step; the reward the agents are paid is scaled by their weight."""
+class Hits:
+    """A team whose every agent collides in its second of four steps."""
 
     def __init__(self, num_agents: int) -> None:
-        super().__init__(batch_size=[num_agents])
-        self.count = 0
+        self.num_agents = num_agents
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
-        self.count = 0
-        return TensorDict({"done": torch.zeros(*self.batch_size, 1, dtype=torch.bool)}, batch_size=self.batch_size)
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.count += 1
-        hit = self.count == 2
-        number = self.batch_size[0]
-        components = torch.tensor([-0.02, 0.0, 0.5, 1.2, -10.0 if hit else 0.0]).expand(number, 5)
-        return TensorDict(
-            {
-                "contact": torch.full((number, 1), hit),
-                "goal_reached": torch.zeros(number, 1, dtype=torch.bool),
-                "reward_components": components,
-                "velocity": torch.full((number, 4), -0.1),
-                "reward": torch.full((number, 1), 1e6),
-                "done": torch.zeros(number, 1, dtype=torch.bool),
-                "terminated": torch.zeros(number, 1, dtype=torch.bool),
-            },
-            batch_size=self.batch_size,
+    def drive(self, policy: TensorDictModuleBase, episode: int, **asked: Any) -> Driven:
+        assert (asked["observed"], asked["happened"]) == (
+            ("velocity",),
+            ("contact", "goal_reached", "reward_components"),
         )
-
-    def _set_seed(self, seed: int | None) -> None:
-        pass
+        policy(TensorDict({"done": torch.zeros(self.num_agents, 1)}, [self.num_agents]))
+        components = np.tile(np.float32([-0.02, 0.0, 0.5, 1.2, 0.0]), (self.num_agents, 4, 1))
+        components[:, 1, 4] = -10.0
+        done = {
+            "contact": components[..., 4:] < 0.0,
+            "goal_reached": components[..., 4:] > 0.0,
+            "reward_components": components,
+            "action": np.zeros((self.num_agents, 4, 2), np.float32),
+        }
+        return Driven({"velocity": np.full((self.num_agents, 5, 4), -0.1, np.float32)}, done, {})
 
 
 class Nothing(TensorDictModuleBase):
@@ -218,11 +210,9 @@ class Nothing(TensorDictModuleBase):
 @pytest.mark.parametrize("sampled", [False, True])
 def test_a_table_of_known_episodes(sampled: bool) -> None:
     conditions = [Condition(collision_weight=2.0), Condition(collision_weight=1.0)]
-    policy, env = Nothing(), Hits(4)
+    policy, team = Nothing(), Hits(4)
     table = evaluation.table_of(
-        evaluation.measure_map(
-            env, policy, conditions=conditions, num_agents=2, map_index=map_index, steps=4, sampled=sampled
-        )
+        evaluation.measure_map(team, policy, conditions=conditions, num_agents=2, map_index=map_index, sampled=sampled)
         for map_index in (2, 0, 1)
     )
     assert policy.kinds == {ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC}
@@ -237,12 +227,27 @@ def test_a_table_of_known_episodes(sampled: bool) -> None:
     assert table["mean_speed_m_per_s"].to_numpy() == pytest.approx(0.1)
 
 
+def told_environment(
+    world: WorldSettings, algo: AlgoSettings | None, conditions: list[Condition], agents: int, memory: int
+) -> EnvBase:
+    """Make an evaluation's agents as an environment that transforms tell what they are told."""
+    return environment(
+        world,
+        algo,
+        split="evaluation",
+        seed=0,
+        agent_ids=list(range(agents)) * len(conditions),
+        memory=memory,
+        conditions=[condition for condition in conditions for _ in range(agents)],
+    )
+
+
 def test_the_weighted_row_is_paid_with_its_weight_and_reported_without(tmp_path: Path) -> None:
     """RCWR's reward column must compare with every other row's: w_coll is 1 there."""
     settings = tiny_settings("rcwr")
     conditions = [Condition(collision_weight=0.5), Condition(collision_weight=2.0)]
     world = crowded(4)
-    env = evaluation_environment(world, settings.algo, conditions, "evaluation", 0, 2, settings.network.memory)
+    env = told_environment(world, settings.algo, conditions, 2, settings.network.memory)
     tensordict, kept = env.reset(), []
     policy = PursuitPolicy()
     for _ in range(world.task.episode_steps):
@@ -278,7 +283,7 @@ def test_agent_i_of_every_condition_meets_the_same_start(workers: int, monkeypat
     conditions = [Condition(beta=beta) for beta in (-2.0, -1.0, 0.0, -0.5)]
     agents = 3
     world = WorldSettings(settings.map, settings.task, "narrow", num_agents=12, num_workers=workers)
-    env = evaluation_environment(world, settings.algo, conditions, "evaluation", 0, agents, settings.network.memory)
+    env = told_environment(world, settings.algo, conditions, agents, settings.network.memory)
     starts = []
     for _ in range(2):
         first = env.reset().reshape(-1)
@@ -300,7 +305,7 @@ def test_a_run_meets_the_same_episodes_as_the_baseline(run: Path) -> None:
     world = WorldSettings(settings.map, settings.task, "narrow", num_agents=2, num_workers=0)
     poses = []
     for algo, conditions in ((settings.algo, [Condition(beta=-1.0)]), (None, [Condition()])):
-        env = evaluation_environment(world, algo, conditions, "evaluation", 0, 2, settings.network.memory)
+        env = told_environment(world, algo, conditions, 2, settings.network.memory)
         poses.append(env.reset()["pose"])
         env.close()
     assert torch.equal(*poses)
@@ -309,15 +314,14 @@ def test_a_run_meets_the_same_episodes_as_the_baseline(run: Path) -> None:
 def test_actions_are_tanh_of_the_mean(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[TensorDictBase] = []
 
-    def watched(env: EnvBase, policy: TensorDictModuleBase, *given: Any) -> TensorDictBase:
-        def drive(tensordict: TensorDictBase) -> TensorDictBase:
-            out = policy(tensordict)
-            seen.append(out.select("loc", "scale", "action").clone())
-            return out
+    forward = LeanPolicy.forward
 
-        return run_episodes(env, drive, *given)  # type: ignore[arg-type]
+    def watched(self: LeanPolicy, tensordict: TensorDictBase) -> TensorDictBase:
+        out = forward(self, tensordict)
+        seen.append(out.select("loc", "scale", "action").clone())
+        return out
 
-    monkeypatch.setattr(evaluation, "run_episodes", watched)
+    monkeypatch.setattr(LeanPolicy, "forward", watched)
     evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'a'}")
     steps = torch.stack(seen)
     torch.testing.assert_close(steps["action"], steps["loc"].tanh(), rtol=0, atol=1e-6)
@@ -394,14 +398,14 @@ def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> Non
 
 def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     closed: list[bool] = []
-    original: Callable[..., EnvBase] = driver.evaluation_environment
+    original: Callable[..., Team] = driver.evaluation_team
 
-    def watched(*arguments: Any) -> EnvBase:
-        env = original(*arguments)
-        close = env.close
-        monkeypatch.setattr(env, "close", lambda **kwargs: (closed.append(True), close(**kwargs)))
-        return env
+    def watched(*arguments: Any) -> Team:
+        team = original(*arguments)
+        close = team.close
+        monkeypatch.setattr(team, "close", lambda: (closed.append(True), close()))
+        return team
 
-    monkeypatch.setattr(driver, "evaluation_environment", watched)
+    monkeypatch.setattr(driver, "evaluation_team", watched)
     evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     assert closed == [True]

@@ -22,12 +22,15 @@ from rcdsac_trl import train
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline import build, resources
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, newest
-from rcdsac_trl.world.env import NavigationEnv, make_env
+from rcdsac_trl.pipeline.team_processes import Request, TeamProcesses
+from rcdsac_trl.pipeline.teams import Driven
+from rcdsac_trl.world.agents import AgentGroup
+from rcdsac_trl.world.env import make_env
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.workers import WorkerError, Workers
 from tiny import STEPS, TINY, tiny_trainer
 
-WORKERS = ["world.num_workers=2", "schedule.iterations=3", "validation.every_iterations=3"]
+WORKERS = ["collector=single", "world.num_workers=2", "schedule.iterations=3", "validation.every_iterations=3"]
 SMALL = MapSettings(size_m=10.0, layouts=("clutter",), num_movers=0)
 
 
@@ -80,21 +83,42 @@ def test_a_run_goes_on_after_a_worker_was_killed(tmp_path: Path, signalled: Call
     )
 
 
+def test_a_run_goes_on_after_a_team_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rcdsac_trl.pipeline.team_processes.START_METHOD", "fork")  # starts at once
+    ask, asked = TeamProcesses.ask, [0]
+
+    def killing(self: TeamProcesses, request: Request) -> list[Driven]:
+        asked[0] += 1
+        if asked[0] == 2:
+            os.kill(self._processes[1].pid, signal.SIGKILL)
+        return ask(self, request)
+
+    monkeypatch.setattr(TeamProcesses, "ask", killing)
+    run = tmp_path / "run"
+    tiny_trainer(run, "rcdsac_pow", "collector.num_processes=2", "schedule.iterations=3").run()
+    told = "iteration 1, training map 1: worker process 2 of 2 (split train, seed 0, agents 1) was killed by SIGKILL"
+    assert told in (run / "train.log").read_text()
+    assert training_rows(run)["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
+    progress = newest(run / CHECKPOINTS, replay=run / "replay")[0].progress
+    assert (progress.iterations, progress.restarts, progress.skipped_maps) == (3, 1, 1)
+    assert not multiprocessing.active_children()
+
+
 def test_a_validation_after_a_fault_is_what_it_would_have_been(
     tmp_path: Path, tiny_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rcdsac_trl.pipeline.drivers.START_METHOD", "fork")  # starts at once
-    step = NavigationEnv._step
+    step = AgentGroup.step
     left = iter(tmp_path / f"killed{number}" for number in range(2))
     main = os.getpid()
 
-    def dying(self: NavigationEnv, tensordict: TensorDictBase) -> TensorDictBase:
+    def dying(self: AgentGroup, *arguments: Any) -> None:
         if os.getpid() != main and (at := next(left, None)) is not None and not at.exists():
             at.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        return step(self, tensordict)
+        step(self, *arguments)
 
-    monkeypatch.setattr(NavigationEnv, "_step", dying)
+    monkeypatch.setattr(AgentGroup, "step", dying)
     run = tmp_path / "run"
     tiny_trainer(run, "rcdsac_pow", "validation.processes=1").run()
     for table in ("training_episodes.csv", "validation_episodes.csv"):

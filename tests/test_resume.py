@@ -187,7 +187,7 @@ def test_a_run_that_validates_in_place_is_the_same(server: Server, whole: tuple[
     run = tmp_path / "run"
     server.call("train", run, overrides=[*RUN, "validation.processes=0"], evaluate=["best", "last"])
     config = run / "config.yaml"
-    config.write_text(config.read_text().replace("processes: 0", "processes: 1"))
+    config.write_text(config.read_text().replace("  processes: 0", "  processes: 1"))
     assert_equal_runs(run, whole[0])
     assert scalars_shown(run) == scalars_shown(whole[0])
 

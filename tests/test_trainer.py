@@ -19,7 +19,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.build.agent import make_loss
 from rcdsac_trl.pipeline.checkpoint import load_weights
-from rcdsac_trl.pipeline.collection import Episodes
+from rcdsac_trl.pipeline.collection import CollectorEpisodes
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS
 from rcdsac_trl.pipeline.saved import Progress, load_progress
@@ -198,7 +198,7 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
     return Trainer(
         schedule=Schedule(**schedule | changes.get("schedule", {})),
         progress=parts["progress"],
-        episodes=Episodes(
+        episodes=CollectorEpisodes(
             lambda iteration, map_index: Collector(events, iteration, map_index),  # type: ignore[arg-type,return-value]
             lambda iteration: events.append(("iteration", iteration)),
             iteration=parts["progress"].iterations,
@@ -615,7 +615,8 @@ def test_workers_do_not_change_a_run(
 ) -> None:
     """Workers in this process: the same code with the same shapes, without the time that processes take."""
     monkeypatch.setattr("rcdsac_trl.pipeline.build.world.make_env", partial(make_env, serial=True))
-    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", f"world.num_workers={workers}")
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "collector=single", f"world.num_workers={workers}")
+    assert isinstance(trainer.episodes, CollectorEpisodes)
     assert trainer.episodes._collector is not None
     assert trainer.episodes._collector.env.batch_size == torch.Size([workers, AGENTS // workers])
     trainer.run()
@@ -623,8 +624,9 @@ def test_workers_do_not_change_a_run(
 
 
 @pytest.mark.slow
-def test_worker_processes_do_not_change_a_run(tiny_run: Path, tmp_path: Path) -> None:
-    tiny_trainer(tmp_path / "run", "rcdsac_pow", "world.num_workers=2").run()
+@pytest.mark.parametrize("given", [["collector=single", "world.num_workers=2"], ["collector.num_processes=2"]])
+def test_worker_processes_do_not_change_a_run(tiny_run: Path, tmp_path: Path, given: list[str]) -> None:
+    tiny_trainer(tmp_path / "run", "rcdsac_pow", *given).run()
     assert_equal_runs(tiny_run, tmp_path / "run")
 
 
@@ -736,20 +738,22 @@ def test_every_validation_sees_the_same_maps_whatever_the_seed_of_the_run(tmp_pa
     assert looked_at == {(0, 0), (0, 1)}
 
 
-def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: Path) -> None:
+@pytest.mark.parametrize("collector", ["multi", "single"])
+def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: Path, collector: str) -> None:
     settings = tiny_settings()
-    trainer = tiny_trainer(tmp_path / "run")
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", f"collector={collector}")
     for iteration in range(ITERATIONS):
         batch = trainer.episodes.collect(iteration, iteration)
         assert batch.batch_size == torch.Size([AGENTS, STEPS])
         fresh = NavigationEnv(settings.map, settings.task, seed=0, agent_ids=range(AGENTS), first_episode=iteration)
         start = fresh.reset()
-        for key in ("pose", "range", "waypoint", "velocity"):
+        for key in ("range", "waypoint", "velocity"):
             assert torch.equal(batch[key][:, 0], start[key]), key
         fresh.close()
-        # Nobody terminates, and only the time limit truncates.
-        assert not batch["next", "terminated"].any()
-        assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * (STEPS - 1) + [True]] * AGENTS
+        if collector == "single":  # else nobody asks: an episode is what a team drives
+            # Nobody terminates, and only the time limit truncates.
+            assert not batch["next", "terminated"].any()
+            assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * (STEPS - 1) + [True]] * AGENTS
         # What is told stays for the whole episode.
         assert (batch["risk"] == batch["risk"][:, :1]).all()
     trainer.episodes.close()

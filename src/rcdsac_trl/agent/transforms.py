@@ -11,6 +11,7 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
@@ -62,6 +63,15 @@ class EpisodeSampler(Transform):
         self._next_episodes = [first_episode] * len(self.agent_ids)
         self._told = torch.zeros(len(self.agent_ids), 1)
 
+    def told(self, episode: int) -> Tensor:
+        """Return what all agents are told in an episode, ``[N, 1]``."""
+        return torch.tensor([[self._of(row, episode)] for row in range(len(self.agent_ids))])
+
+    def _of(self, row: int, episode: int) -> float:
+        if self.fixed is not None:
+            return self.fixed[row]
+        return self.draw(stream(self.seed, self.key, episode, self.agent_ids[row]).random(), episode)
+
     def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         marked = None if tensordict is None else tensordict.get("_reset", None)
         brought = None if tensordict is None else tensordict.get(self.key, None)
@@ -69,13 +79,7 @@ class EpisodeSampler(Transform):
         for row in rows:
             episode = self._next_episodes[row]
             self._next_episodes[row] += 1
-            if brought is not None:
-                self._told[row] = brought.reshape(-1)[row]
-            elif self.fixed is not None:
-                self._told[row] = self.fixed[row]
-            else:
-                u = stream(self.seed, self.key, episode, self.agent_ids[row]).random()
-                self._told[row] = self.draw(u, episode)
+            self._told[row] = self._of(row, episode) if brought is None else brought.reshape(-1)[row]
         return tensordict_reset.set(self.key, self._told.clone().view(*tensordict_reset.batch_size, 1))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -33,25 +33,26 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def resolve_processes(num_workers: int | Literal["auto"], num_maps: int) -> int:
+def resolve_processes(num_workers: int | Literal["auto"], at_most: int, key: str = "num_workers") -> int:
     """Return how many processes drive besides this one; 0: this one drives itself.
 
     Args:
         num_workers: ``"auto"`` takes one for each core that this process may use, none where that is one.
-        num_maps: there is no use for more processes than maps.
+        at_most: there is no use for more processes: the number of maps, or of agents.
+        key: of the number, for messages.
 
     Raises:
         UserInputError: if there is no such number of processes.
 
     Example:
-        >>> resolve_processes(4, num_maps=3), resolve_processes(4, num_maps=1)
+        >>> resolve_processes(4, at_most=3), resolve_processes(4, at_most=1)
         (3, 0)
     """
     if num_workers == "auto":
         num_workers = cores()
     if not isinstance(num_workers, int) or num_workers < 0:
-        raise UserInputError(f"num_workers={num_workers!r} is not a number of processes: give 0 or more, or auto")
-    used = min(num_workers, num_maps)
+        raise UserInputError(f"{key}={num_workers!r} is not a number of processes: give 0 or more, or auto")
+    used = min(num_workers, at_most)
     return used if used > 1 else 0
 
 

@@ -9,9 +9,7 @@ from typing import Any
 
 import pandas as pd
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
@@ -20,65 +18,33 @@ from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.metrics import METRICS, Condition, episode_metrics, summarise
 from rcdsac_trl.pipeline.resources import check_writable
+from rcdsac_trl.pipeline.teams import Team
 
 # What an episode's row needs; everything else of a step is dropped at once.
-_KEPT = [("next", key) for key in ("contact", "goal_reached", "reward_components", "velocity")]
-
-
-def run_episodes(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    steps: int,
-    episode: int | None = None,
-    before_step: Callable[[], None] = interruption_point,
-) -> TensorDictBase:
-    """Drive one episode in every agent of the env.
-
-    Args:
-        env: holds the agents.
-        policy: writes `action`.
-        steps: length of an episode.
-        episode: number of the episode and its map; None: the env's next one.
-        before_step: called before each step.
-
-    Returns:
-        TensorDict ``[N, steps]`` with the keys that :func:`episode_metrics` reads; N counts the env's agents in
-        the order of their batch.
-    """
-    tensordict = env.reset() if episode is None else env.reset(episode=episode)
-    kept = []
-    for _ in range(steps):
-        before_step()
-        tensordict = env.step(policy(tensordict))
-        kept.append(tensordict.select(*_KEPT).flatten())
-        tensordict = env.step_mdp(tensordict)
-    return torch.stack(kept, 1)
+_OBSERVED = ("velocity",)
+_HAPPENED = ("contact", "goal_reached", "reward_components")
 
 
 def measure_map(
-    env: EnvBase,
+    team: Team,
     policy: TensorDictModuleBase,
     *,
     conditions: Sequence[Condition],
     num_agents: int,
     map_index: int,
-    steps: int,
     sampled: bool = False,
-    episode: int | None = None,
     before_step: Callable[[], None] = interruption_point,
 ) -> Rows:
     """Measure a policy on one map.
 
     Args:
-        env: holds ``len(conditions) * num_agents`` agents, condition after condition; agent i of every condition
-            meets the same map, start and goals.
+        team: ``len(conditions) * num_agents`` agents, condition after condition; agent i of every condition meets the
+            same map, start and goals.
         policy: writes `action`.
-        conditions: what the agents of each block are told (the env's transforms tell them; here it labels rows).
+        conditions: what the agents of each block are told (the team tells them; here it labels rows).
         num_agents: episodes a map and a condition.
-        map_index: the map's number in the rows.
-        steps: length of an episode.
+        map_index: number of the map and its episode.
         sampled: draw actions instead of taking tanh(mean).
-        episode: see :func:`run_episodes`.
         before_step: called before each step.
 
     Returns:
@@ -86,7 +52,8 @@ def measure_map(
     """
     kind = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
-        measured = episode_metrics(run_episodes(env, policy, steps, episode, before_step))
+        driven = team.drive(policy, map_index, observed=_OBSERVED, happened=_HAPPENED, before_step=before_step)
+    measured = episode_metrics(driven.tensordict())
     rows = []
     for i in range(len(conditions) * num_agents):
         condition = conditions[i // num_agents]

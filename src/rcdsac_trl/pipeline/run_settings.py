@@ -52,6 +52,23 @@ class TeamSettings:
 
 
 @dataclass(frozen=True)
+class CollectorSettings:
+    """What collects the episodes (``conf/collector``)."""
+
+    name: Literal["multi", "single"]
+    num_processes: Workers = 0
+
+    def __post_init__(self) -> None:
+        """Refuse processes that there cannot be."""
+        resolve_processes(self.num_processes, 1, "collector.num_processes")
+        if self.name == "single" and self.num_processes != 0:
+            raise UserInputError(
+                f"collector.num_processes={self.num_processes} does nothing with collector=single: give "
+                "world.num_workers, or take collector=multi"
+            )
+
+
+@dataclass(frozen=True)
 class ReplaySettings:
     """The replay's size."""
 
@@ -107,11 +124,18 @@ class TrainingSettings:
     schedule: Schedule
     validation: ValidationSettings
     checkpoint: CheckpointSettings
+    # Runs of earlier versions name none: this is what they had.
+    collector: CollectorSettings = CollectorSettings("single")
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together, or not this machine."""
         _check_least("seed", self.seed, 0)
         runtime.resolve_threads(self.threads)
+        if self.collector.name == "multi" and self.world.num_workers != 0:
+            raise UserInputError(
+                f"world.num_workers={self.world.num_workers} does nothing with collector=multi: give "
+                "collector.num_processes, or take collector=single"
+            )
         if self.schedule.distortion_strength(0) < 1:
             self.algo.distortion.measure.temper(0.0, 0.0)  # refuses a measure without a neutral beta
         if not self.algo.default_conditions:

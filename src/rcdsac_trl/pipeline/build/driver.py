@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.pipeline import runtime
 from rcdsac_trl.pipeline.build.agent import make_actor, make_policy
-from rcdsac_trl.pipeline.build.world import evaluation_environment
+from rcdsac_trl.pipeline.build.world import evaluation_team
 from rcdsac_trl.pipeline.drivers import Drive, Rows
 from rcdsac_trl.pipeline.evaluation import measure_map
 from rcdsac_trl.pipeline.metrics import Condition
@@ -59,7 +59,7 @@ def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
     runtime.set_threads(course.threads)
     algo = None if actor is None else course.trained.algo
     memory = course.trained.network.memory
-    env = evaluation_environment(
+    team = evaluation_team(
         course.world, algo, course.conditions, course.split, course.seed, course.num_episodes, memory
     )
     noise = AgentNoise(range(len(course.conditions) * course.num_episodes))
@@ -69,21 +69,19 @@ def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
         # By the map's number, so that it does not matter which process drives it.
         noise.begin(course.seed, "evaluation actions", map_index)
         return measure_map(
-            env,
+            team,
             policy,
             conditions=course.conditions,
             num_agents=course.num_episodes,
             map_index=map_index,
-            steps=course.world.task.episode_steps,
             sampled=course.sampled,
-            episode=map_index,
             before_step=before_step,
         )
 
     try:
         yield drive
     finally:
-        env.close()
+        team.close()
         torch.set_num_threads(threads)
 
 

@@ -9,8 +9,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from torchrl.collectors import Collector
-from torchrl.envs.utils import ExplorationType
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.agent.targets import FusedSoftUpdate
@@ -20,19 +18,16 @@ from rcdsac_trl.pipeline.build.agent import (
     make_average,
     make_loss,
     make_optimizer,
-    make_policy,
     make_relabel,
     parameters,
 )
+from rcdsac_trl.pipeline.build.collection import make_episodes
 from rcdsac_trl.pipeline.build.driver import Course, driver
 from rcdsac_trl.pipeline.build.read import settings_of_run, training_settings
-from rcdsac_trl.pipeline.build.world import environment
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators, load_average, rotate
-from rcdsac_trl.pipeline.collection import Episodes
 from rcdsac_trl.pipeline.drivers import cores, resolve_processes_beside
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.guard import FiniteGuard, load_failure
-from rcdsac_trl.pipeline.policies import AgentNoise, CollectionPolicy
 from rcdsac_trl.pipeline.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
@@ -222,7 +217,7 @@ def _assemble(
     return Trainer(
         schedule=settings.schedule,
         progress=progress,
-        episodes=_episodes(settings, loss, device, progress),
+        episodes=make_episodes(settings, loss.actor_network, device, progress),
         learner=learner,
         guard=FiniteGuard(folder, loss, optimizer),
         validate=_validation(settings, device, threads),
@@ -245,43 +240,6 @@ def _restore(folder: Path, checkpoints: Checkpoints, saved: Saved) -> tuple[Prog
     if damage is None:
         return saved.progress, told
     return replace(saved.progress, best_score=None, best_iterations=None), [*told, damage]
-
-
-def _episodes(settings: TrainingSettings, loss: LossModule, device: str, progress: Progress) -> Episodes:
-    """Make what collects the episodes of each iteration."""
-    schedule, world = settings.schedule, settings.training_world
-    exploration = AgentNoise(range(world.num_agents))
-    policy = CollectionPolicy(
-        make_policy(loss.actor_network, exploration, device),
-        noise=exploration,
-        seed=settings.seed,
-        pursuit_iterations=schedule.pursuit_iterations,
-        pursuit_noise=schedule.pursuit_noise,
-    )
-    iteration_steps = world.num_agents * world.task.episode_steps
-
-    def collector(iteration: int, map_index: int) -> Collector:
-        env = environment(
-            world,
-            settings.algo,
-            split="train",
-            seed=settings.seed,
-            agent_ids=range(world.num_agents),
-            memory=settings.network.memory,
-            first_episode=map_index,  # episode k of every agent is on map k
-        )
-        return Collector(
-            env,
-            policy,
-            frames_per_batch=iteration_steps,
-            total_frames=(schedule.iterations - iteration) * iteration_steps,
-            exploration_type=ExplorationType.RANDOM,
-            trust_policy=True,
-            use_buffers=False,
-        )
-
-    done = progress.iterations
-    return Episodes(collector, policy.set_iteration, iteration=done, map_index=done + progress.skipped_maps)
 
 
 def _pending(

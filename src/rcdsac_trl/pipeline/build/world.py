@@ -1,4 +1,4 @@
-"""Environments with everything a policy reads."""
+"""Environments and teams with everything a policy reads."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,8 @@ from rcdsac_trl.agent.actor import recurrent_state_primer
 from rcdsac_trl.agent.transforms import EpisodeSampler
 from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.settings import AlgoSettings, WorldSettings
-from rcdsac_trl.world.env import make_env
+from rcdsac_trl.pipeline.teams import Team
+from rcdsac_trl.world.env import NavigationEnv, make_env
 from rcdsac_trl.world.maps import Split
 
 
@@ -35,7 +36,6 @@ def environment(
         conditions: tell agent i ``conditions[i]``; None draws what they are told an episode.
         first_episode: number of each agent's first episode.
     """
-    weighted = algo is not None and algo.collision_weight is not None
     base = make_env(
         world.map_settings,
         world.task,
@@ -45,7 +45,7 @@ def environment(
         agent_ids=agent_ids,
         num_workers=world.num_workers,
         first_episode=first_episode,
-        weighted_collisions=weighted,
+        weighted_collisions=_is_weighted(algo),
         worker_timeout_s=world.worker_timeout_s,
         gui=world.gui,
     )
@@ -53,18 +53,51 @@ def environment(
     env.append_transform(InitTracker())
     env.append_transform(StepCounter(max_steps=world.task.episode_steps))
     env.append_transform(recurrent_state_primer(memory))
-    if algo is not None and algo.context_key is not None:
-        env.append_transform(_told(algo, seed, agent_ids, conditions, first_episode))
+    told = _told(algo, seed, agent_ids, conditions, first_episode)
+    if told is not None:
+        env.append_transform(told)
     return env
 
 
+def team(
+    world: WorldSettings,
+    algo: AlgoSettings | None,
+    *,
+    split: Split,
+    seed: int,
+    agent_ids: Sequence[int],
+    memory: int,
+    conditions: Sequence[Condition] | None = None,
+) -> Team:
+    """Make agents of this process that drive whole episodes; arguments as for :func:`environment`."""
+    env = NavigationEnv(
+        world.map_settings,
+        world.task,
+        sensor=world.sensor,
+        split=split,
+        seed=seed,
+        agent_ids=agent_ids,
+        weighted_collisions=_is_weighted(algo),
+        gui=world.gui,
+    )
+    told = _told(algo, seed, agent_ids, conditions, 0)
+    return Team(env, told, memory=memory, steps=world.task.episode_steps)
+
+
+def _is_weighted(algo: AlgoSettings | None) -> bool:
+    return algo is not None and algo.collision_weight is not None
+
+
 def _told(
-    algo: AlgoSettings,
+    algo: AlgoSettings | None,
     seed: int,
     agent_ids: Sequence[int],
     conditions: Sequence[Condition] | None,
     first_episode: int,
-) -> EpisodeSampler:
+) -> EpisodeSampler | None:
+    """Make what tells the agents their beta or collision weight; None where they are told nothing."""
+    if algo is None or algo.context_key is None:
+        return None
     fixed: list[float] | None = None
     if algo.collision_weight is not None:
         low, high = algo.collision_weight
@@ -91,7 +124,7 @@ def _told(
     )
 
 
-def evaluation_environment(
+def evaluation_team(
     world: WorldSettings,
     algo: AlgoSettings | None,
     conditions: Sequence[Condition],
@@ -99,9 +132,9 @@ def evaluation_environment(
     seed: int,
     num_agents: int,
     memory: int,
-) -> EnvBase:
-    """Make an environment in which a block of agents drives under each condition, side by side on the same map."""
-    return environment(
+) -> Team:
+    """Make a team in which a block of agents drives under each condition, side by side on the same map."""
+    return team(
         world,
         algo,
         split=split,
