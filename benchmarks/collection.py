@@ -2,7 +2,8 @@
 
 `env_steps_per_second`: `NavigationEnv` alone on one core, whole episodes and their resets. `bullet_fraction`: its rate
 over the rate of a loop that makes only the PyBullet calls of the same motor steps; blocks of both alternate.
-`collector_steps_per_second`: TorchRL's collector, transforms, GRU policy, replay, on all cores this process may use.
+`collector_steps_per_second`: a training's own collection into its replay, by the faster of one process and one a core;
+the same through TorchRL's collector, in one process and through `ParallelEnv`, is told beside it.
 `naive_steps_per_second`: the same environment as one would write it first, a worker for each agent.
 """
 
@@ -47,56 +48,68 @@ def _drive(env: Any, recording: bench.Recording) -> None:
         env.step(tensordict.set("action", action))
 
 
-def collected(num_workers: int | str, batches: int, steps: int) -> float:
-    """Time the collection of a training.
+def collected(overrides: list[str], batches: int, *, wall: bool) -> float:
+    """Time the collection of a training, as the training builds it, into its replay.
+
+    Args:
+        overrides: of the training's config.
+        batches: iterations that are timed; the fastest counts.
+        wall: count time, not this process's processor time.
 
     Returns:
-        Agent steps a second: of processor time where all is in this process, which has one thread; of wall time with
-        workers.
+        Agent steps a second.
     """
-    import torch
-    from torchrl.collectors import Collector
-    from torchrl.envs.utils import ExplorationType
-
-    from rcdsac_trl.pipeline.build.agent import make_loss, make_policy
+    from rcdsac_trl.pipeline.build.collection import make_episodes
     from rcdsac_trl.pipeline.build.read import training_settings
-    from rcdsac_trl.pipeline.build.training import make_replay
-    from rcdsac_trl.pipeline.build.world import environment
+    from rcdsac_trl.pipeline.build.training import make_learner
     from rcdsac_trl.pipeline.cli import compose
+    from rcdsac_trl.pipeline.saved import Progress
 
-    given = ["+algo=rcdsac_pow", f"task.episode_steps={steps}", f"world.num_workers={num_workers}"]
+    given = ["+algo=rcdsac_pow", "schedule.pursuit_iterations=0", *overrides]
     settings = training_settings(compose("train", given))
-    env = environment(
-        settings.training_world,
-        settings.algo,
-        split="train",
-        seed=0,
-        agent_ids=range(bench.NUM_AGENTS),
-        memory=settings.network.memory,
-    )
-    policy = make_policy(make_loss(settings, "cpu").actor_network, torch.Generator(), "cpu")
-    replay = make_replay(settings, "cpu")
-    per_batch = bench.NUM_AGENTS * steps
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=per_batch,
-        total_frames=per_batch * (batches + 1),
-        exploration_type=ExplorationType.RANDOM,
-        trust_policy=True,
-        use_buffers=False,
-    )
-    episodes = iter(collector)
+    learner = make_learner(settings, "cpu")
+    episodes = make_episodes(settings, learner.loss.actor_network, "cpu", Progress())
+    iterations = iter(range(batches + 1))
 
     def collect() -> None:
-        batch = next(episodes)
-        replay.add_episodes(batch.reshape(-1, batch.shape[-1]))
+        iteration = next(iterations)
+        learner.replay.add_episodes(episodes.collect(iteration, iteration))
 
     collect()  # workers start, code is compiled
-    seconds_of = bench.wall_seconds if num_workers else bench.cpu_seconds
+    seconds_of = bench.wall_seconds if wall else bench.cpu_seconds
     seconds = min(seconds_of(collect) for _ in range(batches))
-    collector.shutdown()
-    return per_batch / seconds
+    episodes.close()
+    return settings.world.num_agents * settings.task.episode_steps / seconds
+
+
+def collectors(overrides: list[str], batches: int) -> dict[str, float]:
+    """Time every way to collect; processes by wall time, since several of them count."""
+    in_process, by_torchrl = ["collector.num_processes=0"], ["collector=single"]
+    return {
+        "in_process_steps_per_second": collected([*overrides, *in_process], batches, wall=False),
+        "processes_steps_per_second": collected(overrides, batches, wall=True),
+        "torchrl_steps_per_second": collected([*overrides, *by_torchrl], batches, wall=False),
+        "parallel_env_steps_per_second": collected(
+            [*overrides, *by_torchrl, "world.num_workers=auto"], batches, wall=True
+        ),
+    }
+
+
+def measure(maps: int, repeats: int, steps: int, overrides: list[str]) -> dict[str, Any]:
+    """Measure all rates and their ratios."""
+    import naive
+
+    results: dict[str, Any] = {"cores": len(bench.cores())}
+    results |= bare(maps, repeats, steps)
+    results |= collectors(overrides, max(repeats - 2, 1))
+    results["collector_steps_per_second"] = max(
+        results["in_process_steps_per_second"], results["processes_steps_per_second"]
+    )
+    results["naive_steps_per_second"] = naive.steps_per_second(steps=min(steps, 100))
+    results["collector_over_env"] = results["collector_steps_per_second"] / results["env_steps_per_second"]
+    results["env_over_naive"] = results["env_steps_per_second"] / results["naive_steps_per_second"]
+    results["collector_over_naive"] = results["collector_steps_per_second"] / results["naive_steps_per_second"]
+    return results
 
 
 def main() -> None:
@@ -104,23 +117,10 @@ def main() -> None:
     parser.add_argument("--maps", type=int, default=3, help="episodes of the bare environment")
     parser.add_argument("--repeats", type=int, default=5, help="repetitions of each; the fastest counts")
     parser.add_argument("--steps", type=int, default=300, help="agent steps of an episode that are timed")
+    parser.add_argument("overrides", nargs="*", default=[], help="further keys of conf/train.yaml, as key=value")
     options = parser.parse_args()
     bench.prepare()
-    import naive
-
-    results: dict[str, Any] = {"cores": len(bench.cores())}
-    results |= bare(options.maps, options.repeats, options.steps)
-    batches = max(options.repeats - 2, 1)
-    results["in_process_steps_per_second"] = collected(0, batches, 1000)
-    results["workers_steps_per_second"] = collected("auto", batches, 1000)
-    results["collector_steps_per_second"] = max(
-        results["in_process_steps_per_second"], results["workers_steps_per_second"]
-    )
-    results["naive_steps_per_second"] = naive.steps_per_second(steps=100)
-    results["collector_over_env"] = results["collector_steps_per_second"] / results["env_steps_per_second"]
-    results["env_over_naive"] = results["env_steps_per_second"] / results["naive_steps_per_second"]
-    results["collector_over_naive"] = results["collector_steps_per_second"] / results["naive_steps_per_second"]
-    bench.report(results, options)
+    bench.report(measure(options.maps, options.repeats, options.steps, options.overrides), options)
 
 
 if __name__ == "__main__":

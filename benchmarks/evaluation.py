@@ -17,14 +17,21 @@ def main() -> None:
     parser = bench.parser(__doc__)
     parser.add_argument("--maps", type=int, default=MAPS, help="maps that are driven")
     parser.add_argument("--num-workers", default="auto", help="processes, as num_workers of conf/evaluate.yaml")
+    parser.add_argument("overrides", nargs="*", default=[], help="of the training's config, as key=value")
     options = parser.parse_args()
     bench.prepare()
     from rcdsac_trl.pipeline import build
     from rcdsac_trl.pipeline.cli import compose
 
     with tempfile.TemporaryDirectory() as folder:
-        run = untrained(Path(folder) / "run")
-        given = [f"run={run}", "beta=[-1]", f"num_workers={options.num_workers}", f"num_maps={options.maps + 2}"]
+        run = untrained(Path(folder) / "run", options.overrides)
+        given = [
+            f"run={run}",
+            "checkpoint=last",
+            "beta=[-1]",
+            f"num_workers={options.num_workers}",
+            f"num_maps={options.maps + 2}",
+        ]
         evaluation = build.evaluation(compose("evaluate", given))
         done = [time.perf_counter() for _ in evaluation.maps()]
     # From the second map done, when every process of two is at work, to the last.
@@ -42,20 +49,22 @@ def main() -> None:
     )
 
 
-def untrained(folder: Path) -> Path:
-    """Write a run folder whose agent has its first weights and the default world."""
+def untrained(folder: Path, overrides: list[str]) -> Path:
+    """Write a run folder whose agent has its first weights, by default in the default world."""
     from rcdsac_trl.pipeline import logs
-    from rcdsac_trl.pipeline.build.agent import make_average, make_loss, make_optimizer
+    from rcdsac_trl.pipeline.build.agent import make_average, make_loss
     from rcdsac_trl.pipeline.build.read import training_settings
     from rcdsac_trl.pipeline.checkpoint import Checkpoints
     from rcdsac_trl.pipeline.cli import compose
+    from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress
 
-    cfg = compose("train", ["+algo=rcdsac_pow", "logger=none"])
+    cfg = compose("train", ["+algo=rcdsac_pow", "logger=none", *overrides])
     settings = training_settings(cfg)
+    folder.mkdir(parents=True)
     logs.start_run_folder(folder, cfg, {})
     loss = make_loss(settings, "cpu")
     average = make_average(loss, settings.learner)
-    Checkpoints(folder / "checkpoints", loss, average, make_optimizer(loss, settings.learner)).save("best", {})
+    Checkpoints(folder / CHECKPOINTS, {"loss": loss, "average": average}, replay=None, keep=1).save(Progress(), {})
     return folder
 
 

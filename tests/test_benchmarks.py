@@ -1,0 +1,102 @@
+"""Every program of benchmarks/ still runs: its smallest form, in this process."""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from tiny import TINY
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+NAMES = {path.stem for path in BENCHMARKS.glob("*.py")}
+SMALL = [*TINY, "world.num_agents=2"]
+
+
+@pytest.fixture
+def load(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Import a program by its plain name, as they import each other; forget all of them afterwards."""
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else this process would start again
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    before = {name: sys.modules.pop(name, None) for name in NAMES}
+    yield importlib.import_module
+    for name, module in before.items():
+        sys.modules.pop(name, None)
+        if module is not None:
+            sys.modules[name] = module
+
+
+def run(program: ModuleType, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", [str(program.__file__), *arguments])
+    program.main()
+
+
+def printed(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_collection(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    program, naive = load("collection"), load("naive")
+    monkeypatch.setattr(load("bench_world"), "NUM_AGENTS", 2)
+    env = naive.naive_env  # its workers take longer than all else together: here it is driven in this process
+    monkeypatch.setattr(naive, "steps_per_second", lambda steps: 1.0)
+    run(program, monkeypatch, "--json", "--maps=1", "--repeats=1", "--steps=2", *SMALL)
+    found = printed(capsys)
+    keys = ("env_steps_per_second", "bullet_fraction", "collector_steps_per_second", "naive_steps_per_second")
+    assert all(found[key] > 0 for key in keys)
+    simulation = sys.modules["rcdsac_trl.world.simulation"]
+    with monkeypatch.context() as own:  # what it changes in the world is put back
+        own.setattr(simulation, "SHAPES_PER_BODY", simulation.SHAPES_PER_BODY)  # type: ignore[attr-defined]
+        own.setattr(simulation.Simulation, "scan", simulation.Simulation.scan)  # type: ignore[attr-defined]
+        driven = env(0)
+        assert driven.rand_step(driven.reset())["next", "range"].shape == (1, 180)
+        driven.close()
+
+
+def test_evaluation(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    run(load("evaluation"), monkeypatch, "--json", "--maps=1", "--num-workers=0", *SMALL)
+    found = printed(capsys)
+    assert found["extrapolated"]
+    assert found["seconds_for_500_episodes"] > 0
+
+
+def test_learner(load: Any) -> None:
+    common, program = load("bench_common"), load("learner")
+    learner = common.make_learner("rcdsac_pow", SMALL)
+    assert program.count_flops(learner.update) > 0
+    parts = program.time_parts(learner, 1)
+    assert "encoders" in parts
+    assert program.PLAYERS
+
+
+def test_scaling(load: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    learner, world = load("scaling_learner"), load("scaling_world")
+    monkeypatch.setattr(learner, "LEARNER", {"quantiles": ("fractions", [2])})
+    monkeypatch.setattr(learner, "TURNS", 1)
+    assert learner.learner_curves()["quantiles"][2] > 0
+    for name, values in {"AGENTS": (1,), "WORKERS": (0,), "CLUTTER_PER_M2": (0.0,), "REPLAY_STEPS": (1000,)}.items():
+        monkeypatch.setattr(world, name, values)
+    monkeypatch.setattr(world, "_STEPS", 1)
+    monkeypatch.setattr(world, "_TURNS", 1)
+    curves = world.scaling()
+    assert {name: len(curve) for name, curve in curves.items()} == dict.fromkeys(curves, 1)
+    world.draw(curves, tmp_path / "curves.png")
+
+
+def test_whole_job(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    few = [given for given in SMALL if not given.startswith("schedule.iterations")]
+    run(load("whole_job"), monkeypatch, "--json", "--iterations=1", *few)
+    assert printed(capsys)["wall_seconds"] > 0
+
+
+def test_soak(load: Any) -> None:
+    """Its training is the one above; what it says of one is its own."""
+    program = load("soak")
+    steady = [dict.fromkeys(program.TOLERANCES, 1.0) for _ in range(10)]
+    growing = [{name: float(number + 1) for name in program.TOLERANCES} for number in range(10)]
+    assert all(found["flat"] for found in program.verdicts(steady).values())
+    assert not any(found["flat"] for found in program.verdicts(growing).values())
