@@ -148,65 +148,72 @@ def test_episodes_are_views_of_what_was_seen() -> None:
 
 
 # ------------------------------------------------------------------------------------------------ faults
-REQUEST = Request(iteration=0, map_index=0, weights=b"")
-
-
-def answer(process: int) -> Driven:
-    return Driven({}, {"action": np.full((1, 1, 2), process, np.float32)}, {})
+FIRST, SECOND = (Request(iteration, map_index=0, weights=b"") for iteration in range(2))
+TIMEOUT_S = 5.0
 
 
 @contextlib.contextmanager
 def answering(seconds: float, does: str) -> Iterator[Drive]:
-    def drive(request: Request, every_step: Callable[[], None]) -> Driven:
-        until = time.monotonic() + seconds
+    """Answer the first request at once; the second one only after some time, in some way."""
+
+    def drive(request: Request, before_step: Callable[[], None]) -> Driven:
+        until = time.monotonic() + seconds * request.iteration
         while time.monotonic() < until:
             time.sleep(0.01)
             if does == "steps":
-                every_step()
-        if does == "ends":
+                before_step()
+        if does == "ends" and request == SECOND:
             os._exit(7)
-        if does == "fails":
+        if does == "fails" and request == SECOND:
             raise ValueError("a mistake")
-        return answer(os.getpid() % 1000)
+        return Driven({}, {"action": np.full((1, 1, 2), os.getpid() % 1000, np.float32)}, {})
 
     yield drive
 
 
-def processes(*makes: Any, timeout_s: float | None = None) -> TeamProcesses:
-    return TeamProcesses(makes, [f"agents {n}" for n in range(len(makes))], timeout_s)
+@pytest.fixture
+def processes() -> Iterator[Callable[..., TeamProcesses]]:
+    """Start processes that have answered once: what starting takes counts for nothing here."""
+    started: list[TeamProcesses] = []
 
+    def start(*makes: Any) -> TeamProcesses:
+        started.append(teams := TeamProcesses(makes, [f"agents {n}" for n in range(len(makes))], None))
+        teams.ask(FIRST)
+        teams._timeout_s = TIMEOUT_S
+        return teams
 
-def test_slow_processes_that_take_steps_do_not_count_as_hung() -> None:
-    teams = processes(*[partial(answering, 7.0, "steps")] * 2, timeout_s=5.0)
-    answers = teams.ask(REQUEST)
-    pids = [process.pid for process in teams._processes]
-    assert [part.done["action"][0, 0, 0] for part in answers] == [pid % 1000 for pid in pids]
-    teams.close()
+    yield start
+    for teams in started:
+        teams.close()
+        teams.close()  # once more does no harm
     assert not multiprocessing.active_children()
+
+
+def test_slow_processes_that_take_steps_do_not_count_as_hung(processes: Callable[..., TeamProcesses]) -> None:
+    teams = processes(*[partial(answering, TIMEOUT_S + 2.0, "steps")] * 2)
+    pids = [process.pid for process in teams._processes]
+    assert [part.done["action"][0, 0, 0] for part in teams.ask(SECOND)] == [pid % 1000 for pid in pids]
 
 
 @pytest.mark.parametrize(
     ("does", "told"),
     [("ends", "ended with exit code 7"), ("fails", "ended with exit code 1"), ("sleeps", "gave no answer within 5 s")],
 )
-def test_a_process_that_fails_is_named(does: str, told: str) -> None:
+def test_a_process_that_fails_is_named(processes: Callable[..., TeamProcesses], does: str, told: str) -> None:
     slow = 1000.0 if does == "sleeps" else 0.0
-    teams = processes(partial(answering, 0.0, "steps"), partial(answering, slow, does), timeout_s=5.0)
+    teams = processes(partial(answering, 0.0, "steps"), partial(answering, slow, does))
     with pytest.raises(WorkerError, match=rf"^worker process 2 of 2 \(agents 1\) {told}$"):
-        teams.ask(REQUEST)
-    teams.close()
-    teams.close()  # once more does no harm
-    assert not multiprocessing.active_children()
+        teams.ask(SECOND)
 
 
 @pytest.mark.parametrize(
     ("number", "told"), [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "gave no answer within 5 s")]
 )
-def test_a_process_that_cannot_even_be_asked_is_named(number: signal.Signals, told: str) -> None:
-    teams = processes(*[partial(answering, 0.0, "steps")] * 2, timeout_s=5.0)
-    teams.ask(REQUEST)
+def test_a_process_that_cannot_even_be_asked_is_named(
+    processes: Callable[..., TeamProcesses], number: signal.Signals, told: str
+) -> None:
+    teams = processes(*[partial(answering, 0.0, "steps")] * 2)
     os.kill(teams._processes[0].pid, number)
-    large = REQUEST._replace(weights=bytes(10_000_000))  # more than a pipe holds
+    large = SECOND._replace(weights=bytes(10_000_000))  # more than a pipe holds
     with pytest.raises(WorkerError, match=rf"^worker process 1 of 2 \(agents 0\) {told}$"):
         teams.ask(large)
-    teams.close()
