@@ -15,10 +15,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
 from rcdsac_trl.agent.actor import build_policy
+from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.pipeline.build.agent import make_average, make_loss
 from rcdsac_trl.pipeline.policies import PERSISTENCE, AgentNoise, CollectionPolicy, LeanPolicy, OnDevice, PursuitPolicy
 from rcdsac_trl.seeding import stream
-from rcdsac_trl.world.lidar import sensor_mask
 from rcdsac_trl.world.pursuit import pursuit_action
 from tiny import tiny_settings
 
