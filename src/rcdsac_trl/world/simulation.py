@@ -121,6 +121,13 @@ class Simulation:
             physicsClientId=client,
         )
         pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
+        # Nobody looks, but for a body without a visual shape PyBullet meshes all its collision shapes, which takes
+        # longer than all the rest of a reset.
+        self._look = -1
+        if not self._gui:
+            self._look = pybullet.createVisualShape(
+                pybullet.GEOM_BOX, halfExtents=(0.1, 0.1, 0.1), physicsClientId=client
+            )
         self._build_static(map)
         self._build_robot(start_pose)
         self._clearance_m = 0.0
@@ -239,7 +246,7 @@ class Simulation:
                 ],
                 physicsClientId=self._client,
             )
-            pybullet.createMultiBody(0.0, shape, physicsClientId=self._client)
+            pybullet.createMultiBody(0.0, shape, self._look, physicsClientId=self._client)
 
     def _build_robot(self, start_pose: tuple[float, float, float]) -> None:
         """Add the octagonal prism; a flat side faces forward."""
@@ -254,6 +261,7 @@ class Simulation:
         self._robot = pybullet.createMultiBody(
             _ROBOT_MASS_KG,
             shape,
+            self._look,
             basePosition=(x, y, 0.0),
             baseOrientation=pybullet.getQuaternionFromEuler((0.0, 0.0, yaw)),
             physicsClientId=client,
@@ -283,6 +291,7 @@ class Simulation:
                     height=2.0 * _OBSTACLE_HALF_HEIGHT_M,
                     physicsClientId=self._client,
                 ),
+                self._look,
                 basePosition=(x, y, 0.0),
                 physicsClientId=self._client,
             )
