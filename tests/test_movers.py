@@ -9,8 +9,9 @@ from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import Map, MapSettings, Mover, generate_map
-from rcdsac_trl.world.movers import CORNER_CUT_M, PATIENCE_S, START_GAP_M, STOP_GAP_M, Movers, make_tour
+from rcdsac_trl.world.movers import CORNER_CUT_M, START_GAP_M, Movers, make_tour
 from rcdsac_trl.world.planner import Planner
+from rcdsac_trl.world.walk import PATIENCE_S, STOP_GAP_M
 
 
 def walk(movers, seconds, robot=(1e3, 1e3)):

@@ -13,9 +13,9 @@ from rcdsac_trl.seeding import stream
 from rcdsac_trl.world import simulation as world_simulation
 from rcdsac_trl.world.lidar import sector_distances
 from rcdsac_trl.world.maps import Box, Cylinder, Map, MapSettings, Mover, generate_map
-from rcdsac_trl.world.movers import STOP_GAP_M
 from rcdsac_trl.world.planner import Planner
 from rcdsac_trl.world.simulation import Simulation
+from rcdsac_trl.world.walk import STOP_GAP_M
 
 APOTHEM_M = 0.25 * math.cos(math.pi / 8.0)
 

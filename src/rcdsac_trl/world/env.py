@@ -85,6 +85,10 @@ class NavigationEnv(EnvBase):
             gui=gui,
         )
         self._weighted = weighted_collisions
+        # The arrays that the agents write into, as tensors; what is never true is among them.
+        self._written = {key: torch.from_numpy(array) for key, array in self.agents.buffers.items()}
+        for key in ("done", "terminated"):
+            self._written[key] = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
         self._renderer: Renderer | None = None
         self._make_specs()
 
@@ -141,12 +145,18 @@ class NavigationEnv(EnvBase):
             out[COLLISION_WEIGHT] = weights.clone()
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """Return what a step wrote: it has the shapes and types of the specs, which TorchRL would look up again."""
+        return next_tensordict_out
+
+    @classmethod
+    def _complete_done(cls, done_spec: Composite, data: TensorDictBase) -> TensorDictBase:
+        """Return what a step or reset wrote: ``done`` and ``terminated`` are never missing."""
+        return data
+
     def _emit(self) -> dict[str, torch.Tensor]:
         """Copy what the agents wrote: they write into the same arrays again next time."""
-        out = {key: torch.from_numpy(array.copy()) for key, array in self.agents.buffers.items()}
-        for key in ("done", "terminated"):
-            out[key] = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
-        return out
+        return {key: tensor.clone() for key, tensor in self._written.items()}
 
     def render(self, row: int = 0, caption: str = "") -> np.ndarray:
         """Draw one of the agents from above.

@@ -111,15 +111,19 @@ def _lower_to_ray(out: np.ndarray, bin_: int, border: int, cx: float, cy: float,
 
 @numba.njit(cache=True)
 def scan(
+    out: np.ndarray,
     x: float,
     y: float,
     yaw: float,
     segments: np.ndarray,
     circles: np.ndarray,
     max_range_m: float = MAX_RANGE_M,
-) -> tuple[np.ndarray, float]:
-    """Return what :func:`sector_distances` does, and the smallest of those distances."""
-    out = np.full(NUM_BINS, np.inf)
+) -> float:
+    """Write what :func:`sector_distances` returns to ``out``, and return the smallest of those distances.
+
+    Compiled without fast-math, so that equal input gives equal bits on every call.
+    """
+    out[:] = np.inf
     cos, sin = math.cos(yaw), math.sin(yaw)
     for k in range(segments.shape[0]):
         x0, y0, x1, y1 = segments[k, 0] - x, segments[k, 1] - y, segments[k, 2] - x, segments[k, 3] - y
@@ -147,10 +151,9 @@ def scan(
         if out[k] >= max_range_m:
             out[k] = np.inf
         nearest = min(nearest, out[k])
-    return out, nearest
+    return nearest
 
 
-@numba.njit(cache=True)
 def sector_distances(
     x: float,
     y: float,
@@ -160,8 +163,6 @@ def sector_distances(
     max_range_m: float = MAX_RANGE_M,
 ) -> np.ndarray:
     """Return the exact smallest distance to any obstacle in each 2-degree sector.
-
-    Compiled by numba, without fast-math, so that equal input gives equal bits on every call.
 
     Args:
         x: position of the sensor, map frame, m.
@@ -180,4 +181,6 @@ def sector_distances(
         >>> float(sector_distances(0.0, 0.0, 0.0, wall, np.empty((0, 3)))[0])
         2.0
     """
-    return scan(x, y, yaw, segments, circles, max_range_m)[0]
+    distances = np.empty(NUM_BINS)
+    scan(distances, x, y, yaw, segments, circles, max_range_m)
+    return distances

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.interface import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S, clip_command
+from rcdsac_trl.interface import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S, NUM_BINS, clip_command
+from rcdsac_trl.world import bodies
 from rcdsac_trl.world.bullet import pybullet
 from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.lidar import scan
-from rcdsac_trl.world.maps import Box, Cylinder, Map
+from rcdsac_trl.world.maps import Map
 from rcdsac_trl.world.movers import Movers, WalkPlanner
 
 CONTACT_DISTANCE_M = 1e-3
@@ -28,14 +29,6 @@ The solver lets a pushing robot rest within about 0.01 mm of a wall, on either s
 mm, leaning on a wall would read as a series of collisions.
 """
 
-SHAPES_PER_BODY = 16
-"""Static shapes are joined to compound bodies of up to so many: a body each makes a step 8 times as slow."""
-
-_ROBOT_MASS_KG = 10.0
-_ROBOT_HALF_HEIGHT_M = 0.1
-_OBSTACLE_HALF_HEIGHT_M = 0.5
-# That of a uniform cylinder about its axis; about the other two axes nothing can turn the robot.
-_ROBOT_INERTIA = (1e9, 1e9, 0.5 * _ROBOT_MASS_KG * ROBOT_RADIUS_M**2)
 # Movers farther than this from touching the robot are moved in PyBullet only once an agent step, in which
 # both together go at most 0.2 m.
 _MOVER_SYNC_GAP_M = 0.5
@@ -121,27 +114,23 @@ class Simulation:
             physicsClientId=client,
         )
         pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
-        # Nobody looks, but for a body without a visual shape PyBullet meshes all its collision shapes, which takes
-        # longer than all the rest of a reset.
-        self._look = -1
-        if not self._gui:
-            self._look = pybullet.createVisualShape(
-                pybullet.GEOM_BOX, halfExtents=(0.1, 0.1, 0.1), physicsClientId=client
-            )
-        self._build_static(map)
-        self._build_robot(start_pose)
-        self._clearance_m = 0.0
-        self._movers = Movers(map, planner, start_pose[:2], movers_rng, MOTOR_PERIOD_S)
-        self._mover_radii: list[float] = self._movers.radii.tolist()
-        self._build_movers()
+        visual = -1 if self._gui else bodies.invisible_shape(client)
+        bodies.add_static(client, map, visual)
+        self._robot = bodies.add_robot(client, start_pose, visual)
+        x, y, yaw = start_pose
+        self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
+        self._v_c = self._omega_c = self._clearance_m = 0.0
+        movers = self._movers = Movers(map, planner, start_pose[:2], movers_rng, MOTOR_PERIOD_S)
+        self._mover_bodies = list(
+            zip(bodies.add_movers(client, movers.discs, visual), movers.radii.tolist(), strict=True)
+        )
         self._segments = np.ascontiguousarray(map.segments(), dtype=np.float64)
         static = np.asarray(map.circles(), dtype=np.float64).reshape(-1, 3)
-        # The last rows are the movers'; scan() writes their positions.
-        movers = np.column_stack([self._movers.positions, self._movers.radii])
-        self._circles = np.ascontiguousarray(np.concatenate([static, movers]))
-        self._mover_circles = self._circles[len(static) :]
+        # The last rows are the movers' own, so that they are sensed where they walk.
+        self._circles = np.concatenate([static, movers.discs])
+        movers.discs = self._circles[len(static) :]
         if self._gui:
-            self._look_from_above(map)
+            bodies.look_from_above(client, map)
 
     @property
     def pose(self) -> tuple[float, float, float]:
@@ -166,27 +155,28 @@ class Simulation:
             omega_u: desired angular velocity, rad/s.
             motor_steps: how many steps of 0.02 s, at least 1.
         """
-        client, robot = self._client, self._robot
+        client, robot, movers = self._client, self._robot, self._movers
         x, y, yaw = self._pose
         v_c, omega_c = self._v_c, self._omega_c
         cos, sin = math.cos(yaw), math.sin(yaw)
-        gap_m = self._movers.step(x, y)
+        gap_m = movers.step(x, y)
         self._sync_movers(x, y, everywhere=True)
         duration_s = motor_steps * MOTOR_PERIOD_S
         robot_m = max(abs(v_c), MAX_LINEAR_VELOCITY) * duration_s
-        approach_m = robot_m + self._movers.fastest_m_per_s * duration_s + _SLACK_M
+        approach_m = robot_m + movers.fastest_m_per_s * duration_s + _SLACK_M
         # Movers that cannot notice the robot in this agent step walk through it at once.
-        unnoticed = gap_m > max(self._movers.notice_gap_m, _MOVER_SYNC_GAP_M) + approach_m and not self._gui
+        unnoticed = gap_m > max(movers.notice_gap_m, _MOVER_SYNC_GAP_M) + approach_m and not self._gui
         if unnoticed:
-            self._movers.step(x, y, motor_steps - 1)
+            movers.step(x, y, motor_steps - 1)
         # Contacts that cannot be are not asked for, nor the velocities that only contact would change.
         in_contact = False
         touchable = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
         self._clearance_m = 0.0  # not known until the next scan
         for motor_step in range(motor_steps):
             if motor_step > 0 and not unnoticed:
-                self._movers.step(x, y)
-                self._sync_movers(x, y, everywhere=self._gui)
+                gap_m = movers.step(x, y)
+                if gap_m < _MOVER_SYNC_GAP_M or self._gui:
+                    self._sync_movers(x, y, everywhere=self._gui)
             v, omega = clip_command(v_u, omega_u, v_c, omega_c)
             # By position, which PyBullet reads faster than keywords.
             linear, angular = (v * cos, v * sin, 0.0), (0.0, 0.0, omega)
@@ -215,9 +205,8 @@ class Simulation:
             float64 [180], m; ``inf`` where nothing is within 3 m. See
             :func:`rcdsac_trl.world.lidar.sector_distances`.
         """
-        self._mover_circles[:, :2] = self._movers.positions
-        x, y, yaw = self._pose
-        distances, self._clearance_m = scan(x, y, yaw, self._segments, self._circles)
+        distances = np.empty(NUM_BINS)
+        self._clearance_m = scan(distances, *self._pose, self._segments, self._circles)
         return distances
 
     def close(self) -> None:
@@ -226,94 +215,9 @@ class Simulation:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
 
-    def _build_static(self, map: Map) -> None:
-        """Add walls and clutter as few compound bodies of shapes that lie near each other."""
-        shapes: list[Box | Cylinder] = [*map.boxes, *map.cylinders]
-        for first in range(0, len(shapes), SHAPES_PER_BODY):
-            group = shapes[first : first + SHAPES_PER_BODY]
-            boxes = [isinstance(shape, Box) for shape in group]
-            shape = pybullet.createCollisionShapeArray(
-                shapeTypes=[pybullet.GEOM_BOX if box else pybullet.GEOM_CYLINDER for box in boxes],
-                halfExtents=[
-                    (s.half_x, s.half_y, _OBSTACLE_HALF_HEIGHT_M) if isinstance(s, Box) else (0.0, 0.0, 0.0)
-                    for s in group
-                ],
-                radii=[s.radius if isinstance(s, Cylinder) else 0.0 for s in group],
-                lengths=[2.0 * _OBSTACLE_HALF_HEIGHT_M] * len(group),
-                collisionFramePositions=[(s.x, s.y, 0.0) for s in group],
-                collisionFrameOrientations=[
-                    pybullet.getQuaternionFromEuler((0.0, 0.0, s.yaw if isinstance(s, Box) else 0.0)) for s in group
-                ],
-                physicsClientId=self._client,
-            )
-            pybullet.createMultiBody(0.0, shape, self._look, physicsClientId=self._client)
-
-    def _build_robot(self, start_pose: tuple[float, float, float]) -> None:
-        """Add the octagonal prism; a flat side faces forward."""
-        client = self._client
-        corners = [
-            (ROBOT_RADIUS_M * math.cos(angle), ROBOT_RADIUS_M * math.sin(angle), z)
-            for angle in (math.radians(22.5 + 45.0 * k) for k in range(8))
-            for z in (-_ROBOT_HALF_HEIGHT_M, _ROBOT_HALF_HEIGHT_M)
-        ]
-        shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=corners, physicsClientId=client)
-        x, y, yaw = start_pose
-        self._robot = pybullet.createMultiBody(
-            _ROBOT_MASS_KG,
-            shape,
-            self._look,
-            basePosition=(x, y, 0.0),
-            baseOrientation=pybullet.getQuaternionFromEuler((0.0, 0.0, yaw)),
-            physicsClientId=client,
-        )
-        # Friction and restitution of a contact are products of both bodies': 0 here is 0 everywhere.
-        pybullet.changeDynamics(
-            self._robot,
-            -1,
-            linearDamping=0.0,
-            angularDamping=0.0,
-            lateralFriction=0.0,
-            restitution=0.0,
-            localInertiaDiagonal=_ROBOT_INERTIA,
-            physicsClientId=client,
-        )
-        self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
-        self._v_c = self._omega_c = 0.0
-
-    def _build_movers(self) -> None:
-        """Add the movers as bodies of mass 0: they push and are never pushed."""
-        self._mover_bodies = [
-            pybullet.createMultiBody(
-                0.0,
-                pybullet.createCollisionShape(
-                    pybullet.GEOM_CYLINDER,
-                    radius=radius,
-                    height=2.0 * _OBSTACLE_HALF_HEIGHT_M,
-                    physicsClientId=self._client,
-                ),
-                self._look,
-                basePosition=(x, y, 0.0),
-                physicsClientId=self._client,
-            )
-            for (x, y), radius in zip(self._movers.positions, self._movers.radii, strict=True)
-        ]
-
     def _sync_movers(self, robot_x: float, robot_y: float, everywhere: bool) -> None:
         """Tell PyBullet where the movers are: all of them, or only those that the robot could touch."""
         near = ROBOT_RADIUS_M + _MOVER_SYNC_GAP_M
-        for body, (x, y), radius in zip(
-            self._mover_bodies, self._movers.positions.tolist(), self._mover_radii, strict=True
-        ):
+        for (body, radius), (x, y, _) in zip(self._mover_bodies, self._movers.discs.tolist(), strict=True):
             if everywhere or math.hypot(x - robot_x, y - robot_y) < near + radius:
                 pybullet.resetBasePositionAndOrientation(body, (x, y, 0.0), _UPRIGHT, self._client)
-
-    def _look_from_above(self, map: Map) -> None:
-        """Point the window's camera down on the whole map."""
-        middle = map.size_m / 2.0
-        pybullet.resetDebugVisualizerCamera(
-            cameraDistance=map.size_m,
-            cameraYaw=0.0,
-            cameraPitch=-89.9,
-            cameraTargetPosition=(middle, middle, 0.0),
-            physicsClientId=self._client,
-        )
