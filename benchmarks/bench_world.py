@@ -103,20 +103,26 @@ def only_bullet(env: Any, recording: Recording) -> None:
     """Make a recorded episode's PyBullet calls, and no other: the floor of every environment on this engine.
 
     For each motor step: the movers where they have to be moved, the robot's velocity, the step, then pose, velocity
-    and contacts.
+    and contacts. The agents take turns after each agent step, as in every environment, which is told an action of each
+    of them at a time; one agent's whole episode at once would keep its simulation in the processor's cache.
     """
     from rcdsac_trl.world.bullet import pybullet
 
     upright = (0.0, 0.0, 0.0, 1.0)
-    for (client, robot), calls in zip(bodies(env), recording.calls, strict=True):
-        for movers, linear, angular in calls:
-            for body, xyz in movers:
-                pybullet.resetBasePositionAndOrientation(body, xyz, upright, client)
-            pybullet.resetBaseVelocity(robot, linear, angular, client)
-            pybullet.stepSimulation(client)
-            pybullet.getBasePositionAndOrientation(robot, client)
-            pybullet.getBaseVelocity(robot, client)
-            pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
+    agents = [
+        (client, robot, calls, len(calls) // len(recording.actions))
+        for (client, robot), calls in zip(bodies(env), recording.calls, strict=True)
+    ]
+    for step in range(len(recording.actions)):
+        for client, robot, calls, motor_steps in agents:
+            for movers, linear, angular in calls[step * motor_steps : (step + 1) * motor_steps]:
+                for body, xyz in movers:
+                    pybullet.resetBasePositionAndOrientation(body, xyz, upright, client)
+                pybullet.resetBaseVelocity(robot, linear, angular, client)
+                pybullet.stepSimulation(client)
+                pybullet.getBasePositionAndOrientation(robot, client)
+                pybullet.getBaseVelocity(robot, client)
+                pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
 
 
 def cpu_seconds(work: Callable[[], object]) -> float:

@@ -43,9 +43,11 @@ def bare(num_maps: int, repeats: int, steps: int) -> dict[str, float]:
 
 
 def _drive(env: Any, recording: bench.Recording) -> None:
-    tensordict = env.fake_tensordict().exclude("next")
+    from tensordict import TensorDict
+
     for action in recording.actions:
-        env.step(tensordict.set("action", action))
+        # A new one each time, as a policy hands it over: TorchRL would merge the last step's "next" into the new one.
+        env.step(TensorDict({"action": action}, batch_size=env.batch_size))
 
 
 def collected(overrides: list[str], batches: int, *, wall: bool) -> float:
