@@ -47,22 +47,18 @@ class Countdown(EnvBase):
         del seed
 
 
-def uneven(u: float, episode: int) -> float:
-    return PowerLaw().temper(PowerLaw().from_uniform(u), min(1.0, 0.25 * episode))
-
-
 def make_env(base: EnvBase | None = None, **settings: object) -> TransformedEnv:
     base = base or Countdown()
     env = TransformedEnv(base)
     env.append_transform(InitTracker())
     env.append_transform(recurrent_state_primer(3))
-    arguments = {"draw": uneven, "seed": 7, "agent_ids": range(AGENTS)} | settings
+    arguments = {"draw": PowerLaw().from_uniform, "seed": 7, "agent_ids": range(AGENTS)} | settings
     env.append_transform(EpisodeSampler("risk", **arguments))
     return env
 
 
 def expected(agent: int, episode: int) -> float:
-    return uneven(stream(7, "risk", episode, agent).random(), episode)
+    return PowerLaw().from_uniform(stream(7, "risk", episode, agent).random())
 
 
 def test_specs() -> None:
@@ -79,7 +75,6 @@ def test_each_agent_keeps_its_value_until_its_episode_ends() -> None:
             episode = t // (2 + agent)
             assert rollout["risk"][agent, t].item() == pytest.approx(expected(agent, episode))
             assert rollout["next", "risk"][agent, t].item() == pytest.approx(expected(agent, episode))
-    assert (rollout["risk"][:, 0] == 0.0).all()  # the schedule opens with the neutral beta
     assert rollout["is_init"].sum(1).flatten().tolist() == [6, 4, 3, 3]
 
 
@@ -145,9 +140,7 @@ def test_fixed_values() -> None:
 
 def test_it_serves_collision_weights_too() -> None:
     env = TransformedEnv(Countdown())
-    env.append_transform(
-        EpisodeSampler("collision_weight", lambda u, episode: 0.1 + 1.9 * u, seed=0, agent_ids=range(AGENTS))
-    )
+    env.append_transform(EpisodeSampler("collision_weight", lambda u: 0.1 + 1.9 * u, seed=0, agent_ids=range(AGENTS)))
     check_env_specs(env)
     weights = env.rollout(40, break_when_any_done=False)["collision_weight"]
     assert weights.min() >= 0.1

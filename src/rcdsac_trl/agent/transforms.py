@@ -28,7 +28,7 @@ class EpisodeSampler(Transform):
 
     Args:
         key: where the number is written, ``[*batch, 1]``.
-        draw: turns a uniform number in [0, 1) and the episode's number into the number told.
+        draw: turns a uniform number in [0, 1) into the number told.
         seed: root seed.
         agent_ids: global numbers of the agents, in the order of the flattened batch.
         first_episode: number of the first episode.
@@ -37,7 +37,7 @@ class EpisodeSampler(Transform):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from rcdsac_trl.world.env import make_env
-        >>> sampler = EpisodeSampler("risk", lambda u, episode: -2.0 * u, seed=0, agent_ids=range(2))
+        >>> sampler = EpisodeSampler("risk", lambda u: -2.0 * u, seed=0, agent_ids=range(2))
         >>> TransformedEnv(make_env(num_workers=0, agent_ids=range(2)), sampler).reset()["risk"].shape
         torch.Size([2, 1])
     """
@@ -45,7 +45,7 @@ class EpisodeSampler(Transform):
     def __init__(
         self,
         key: str,
-        draw: Callable[[float, int], float],
+        draw: Callable[[float], float],
         *,
         seed: int,
         agent_ids: Sequence[int],
@@ -70,7 +70,7 @@ class EpisodeSampler(Transform):
     def _of(self, row: int, episode: int) -> float:
         if self.fixed is not None:
             return self.fixed[row]
-        return self.draw(stream(self.seed, self.key, episode, self.agent_ids[row]).random(), episode)
+        return self.draw(stream(self.seed, self.key, episode, self.agent_ids[row]).random())
 
     def _reset(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
         marked = None if tensordict is None else tensordict.get("_reset", None)

@@ -105,7 +105,7 @@ def _told(
             fixed = [c.collision_weight for c in conditions if c.collision_weight is not None]
         return EpisodeSampler(
             "collision_weight",
-            lambda u, episode: low + (high - low) * u,
+            lambda u: low + (high - low) * u,
             seed=seed,
             agent_ids=agent_ids,
             first_episode=first_episode,
@@ -116,7 +116,7 @@ def _told(
         fixed = [c.beta for c in conditions if c.beta is not None]
     return EpisodeSampler(
         "risk",
-        lambda u, episode: measure.from_uniform(u),
+        measure.from_uniform,
         seed=seed,
         agent_ids=agent_ids,
         first_episode=first_episode,
