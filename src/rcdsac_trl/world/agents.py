@@ -124,13 +124,17 @@ class AgentGroup:
             agent.close()
 
     def _checked(self, actions: NDArray) -> list[list[float]]:
-        # The comparison is false for NaN too.
-        if actions.shape != (len(self), ACTION_SIZE) or not (np.abs(actions) <= 1.0 + _ACTION_TOLERANCE).all():
+        values: list[list[float]] = actions.tolist()
+        limit = 1.0 + _ACTION_TOLERANCE
+        # The comparison is false for NaN too. As plain numbers: there are few, and NumPy has a price a call.
+        inside = actions.shape == (len(self), ACTION_SIZE) and all(
+            -limit <= linear <= limit and -limit <= angular <= limit for linear, angular in values
+        )
+        if not inside:
             raise UserInputError(
-                f"actions {actions.tolist()} must be {ACTION_SIZE} numbers in [-1, 1] for each of "
+                f"actions {values} must be {ACTION_SIZE} numbers in [-1, 1] for each of "
                 f"{len(self)} agents; look for NaN in the policy, or scale its output"
             )
-        values: list[list[float]] = actions.tolist()
         return values
 
     def _collect(self, rows: Sequence[int]) -> None:

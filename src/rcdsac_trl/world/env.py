@@ -133,7 +133,7 @@ class NavigationEnv(EnvBase):
         if self._weighted:
             weight = None if tensordict is None else tensordict.get(COLLISION_WEIGHT, None)
             out[COLLISION_WEIGHT] = torch.ones(*self.batch_size, 1) if weight is None else weight.clone()
-        return TensorDict(out, batch_size=self.batch_size, device=self.device)
+        return self._packed(out)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         weights = tensordict.get(COLLISION_WEIGHT) if self._weighted else None
@@ -143,7 +143,7 @@ class NavigationEnv(EnvBase):
         out = self._emit()
         if weights is not None:
             out[COLLISION_WEIGHT] = weights.clone()
-        return TensorDict(out, batch_size=self.batch_size, device=self.device)
+        return self._packed(out)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Return what a step wrote: it has the shapes and types of the specs, which TorchRL would look up again."""
@@ -153,6 +153,10 @@ class NavigationEnv(EnvBase):
     def _complete_done(cls, done_spec: Composite, data: TensorDictBase) -> TensorDictBase:
         """Return what a step or reset wrote: ``done`` and ``terminated`` are never missing."""
         return data
+
+    def _packed(self, out: dict[str, torch.Tensor]) -> TensorDictBase:
+        """Make a tensordict of what has the shapes of the specs: unsafe is what would check that again."""
+        return TensorDict._new_unsafe(out, batch_size=self.batch_size, device=self.device)
 
     def _emit(self) -> dict[str, torch.Tensor]:
         """Copy what the agents wrote: they write into the same arrays again next time."""

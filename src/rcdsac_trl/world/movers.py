@@ -180,21 +180,22 @@ def make_tour(corners: NDArray[np.float64], period_s: float) -> NDArray[np.float
     along = 0.0
     # Twice the crawl, for a half turn, and one period's speeding up are a change of 1 m/s^2 at most.
     crawl2 = (0.2 * MAX_ACCELERATION * period_s) ** 2
-    for k, corner in enumerate(corners):
-        sharp = bends[k] == 0.0 and abs(turns[k]) > 1e-6
-        joint = crawl2 if sharp else math.inf
-        if bends[k] > 0.0:
-            back = headings[k] - turns[k]
-            curvature = math.copysign(1.0 / bends[k], turns[k])
-            x, y = corner - tangents[k] * np.array([math.cos(back), math.sin(back)])
-            end = along + bends[k] * abs(turns[k])
-            pieces.append([along, end, x, y, back, curvature, MAX_ACCELERATION * bends[k]])
+    cut_after = np.roll(tangents, -1).tolist()
+    # As plain numbers: single ones out of arrays are slow.
+    columns = (array.tolist() for array in (*corners.T, lengths, headings, turns, bends, tangents))
+    for (x, y, side, heading, turn, bend, cut), cut_end in zip(zip(*columns, strict=True), cut_after, strict=True):
+        joint = crawl2 if bend == 0.0 and abs(turn) > 1e-6 else math.inf
+        if bend > 0.0:
+            back = heading - turn
+            start = x - cut * math.cos(back), y - cut * math.sin(back)
+            end = along + bend * abs(turn)
+            pieces.append([along, end, *start, back, math.copysign(1.0 / bend, turn), MAX_ACCELERATION * bend])
             joint_speed2.append(joint)
             along = end
-        length = lengths[k] - tangents[k] - tangents[(k + 1) % len(corners)]
+        length = side - cut - cut_end
         if length > 1e-9:
-            x, y = corner + tangents[k] * np.array([math.cos(headings[k]), math.sin(headings[k])])
-            pieces.append([along, along + length, x, y, headings[k], 0.0, math.inf])
+            start = x + cut * math.cos(heading), y + cut * math.sin(heading)
+            pieces.append([along, along + length, *start, heading, 0.0, math.inf])
             joint_speed2.append(joint)
             along += length
     return _with_speeds(np.array(pieces), np.array(joint_speed2))
@@ -203,10 +204,13 @@ def make_tour(corners: NDArray[np.float64], period_s: float) -> NDArray[np.float
 def _with_speeds(pieces: NDArray[np.float64], joint_speed2: NDArray[np.float64]) -> NDArray[np.float64]:
     """Add to each piece the squared speeds at its ends that leave room to brake for what follows."""
     count = len(pieces)
-    gain = 2.0 * PROFILE_ACCELERATION * (pieces[:, END] - pieces[:, START])
-    joint = np.minimum(joint_speed2, np.minimum(pieces[:, SPEED2], np.roll(pieces[:, SPEED2], 1)))
+    # As plain numbers: single ones out of arrays are slow.
+    gain = (2.0 * PROFILE_ACCELERATION * (pieces[:, END] - pieces[:, START])).tolist()
+    joint = np.minimum(joint_speed2, np.minimum(pieces[:, SPEED2], np.roll(pieces[:, SPEED2], 1))).tolist()
     entry, exit_ = joint.copy(), joint.copy()  # at the start of piece k: walking backwards, and forwards
     for k in [*range(count)] * 2:  # twice round: the tour is closed
-        entry[(k + 1) % count] = min(entry[(k + 1) % count], entry[k] + gain[k])
-        exit_[count - 1 - k] = min(exit_[count - 1 - k], exit_[(count - k) % count] + gain[count - 1 - k])
-    return np.column_stack([pieces, entry, np.roll(exit_, -1)])
+        after = k + 1 if k + 1 < count else 0
+        entry[after] = min(entry[after], entry[k] + gain[k])
+        back = count - 1 - k
+        exit_[back] = min(exit_[back], exit_[(back + 1) % count] + gain[back])
+    return np.column_stack([pieces, entry, [*exit_[1:], exit_[0]]])

@@ -71,7 +71,11 @@ class _Layer:
 
     def centre(self, cells: NDArray[np.integer] | np.integer) -> NDArray[np.float64]:
         """Return the centres [..., 2] of flat cell indices [...]."""
-        return (np.stack([cells % self.side, cells // self.side], axis=-1) + 0.5) * CELL_M
+        centres = np.empty((*cells.shape, 2))
+        centres[..., 0], centres[..., 1] = cells % self.side, cells // self.side
+        centres += 0.5
+        centres *= CELL_M
+        return centres
 
     def nearest(self, point: Point) -> int:
         """Return the free cell whose centre is nearest to a point."""
