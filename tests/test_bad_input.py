@@ -301,7 +301,7 @@ def test_a_damaged_run_folder_is_read_or_refused(few: int, name: str, run: Path)
         damaged_copy(path, *way)
         try:
             refused_or_read(lambda: build.evaluation(compose("evaluate", [f"run={run}", "beta=[-1]"])))
-            refused_or_read(lambda: build.run_to_continue([f"resume={run}"], multirun=False))
+            refused_or_read(lambda: build.run_to_continue([f"resume={run}"]))
             refused_or_read(lambda: settings_of_run(run))
         finally:
             path.write_bytes(content)

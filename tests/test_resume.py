@@ -450,7 +450,8 @@ def test_wrong_folders_and_several_runs_are_refused(refusal: Any, tmp_path: Path
     told = refusal(["resume=nowhere"])
     assert told == "resume=nowhere holds no config.yaml: name a folder that training wrote"
     assert refusal(["-m", "resume=auto", "+algo=sac,rcwr"]) == (
-        "resume continues one run: leave -m out, or leave resume out"
+        "resume=auto continues one run: leave -m out; a sweep goes on when its call is repeated with its "
+        "hydra.sweep.dir"
     )
     assert refusal(["resume=auto"]).startswith("no algorithm chosen")
     assert refusal(["resume=auto", "+algo=sac", "seed=-1"]) == "seed=-1 must be at least 0"

@@ -1,4 +1,4 @@
-"""Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``; go on: ``.. resume=runs/<folder>``."""
+"""Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``; go on: ``.. resume=runs/<folder>``; many: ``-m``."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,11 +25,15 @@ def check_folder(folder: Path) -> None:
     logs.check_folder(folder)
 
 
-def continue_run(overrides: list[str], multirun: bool) -> bool:
-    """Continue the run that `resume` means; return whether there was one. Hydra, which makes folders, has no part."""
+def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
+    """Run a sweep, or continue a run, if the call asks for that; return whether it did. Hydra has no part in either."""
     from rcdsac_trl.pipeline import build
 
-    folder = build.run_to_continue(overrides, multirun=multirun)
+    if multirun:
+        build.sweep(overrides).run()
+        return True
+    build.check_single(overrides)
+    folder = build.run_to_continue(overrides)
     if folder is None:
         return False
     trainer = build.resumed(folder)
@@ -40,7 +44,7 @@ def continue_run(overrides: list[str], multirun: bool) -> bool:
     return True
 
 
-@entry_point("train", check=check, check_folder=check_folder, instead=continue_run)
+@entry_point("train", check=check, check_folder=check_folder, instead=sweep_or_continue)
 def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
     from rcdsac_trl.pipeline import build

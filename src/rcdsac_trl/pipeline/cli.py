@@ -14,6 +14,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -119,39 +120,45 @@ def precheck(
     args = read_arguments(argv)
     if args is None:
         return
-    jobs = _jobs(args.overrides) if args.multirun else [args.overrides]
-    for overrides in jobs:
+    for overrides in combinations(args.overrides) if args.multirun else [args.overrides]:
         check(compose(config_name, overrides))
-    if check_folder is None:
-        return
-    folders: set[Path] = set()
-    for number, overrides in enumerate(jobs):
-        folder = output_folder(config_name, overrides, job_number=number if args.multirun else None)
-        if folder in folders:
-            raise UserInputError(f"{folder} would hold several of these runs: put what differs into hydra.sweep.subdir")
-        check_folder(folder)
-        folders.add(folder)
+    if check_folder is not None:
+        check_folder(output_folder(config_name, args.overrides))
 
 
-def output_folder(config_name: str, overrides: list[str], *, job_number: int | None = None) -> Path:
-    """Return the folder that a run would write into, where it is a job of a multirun as the job of that number."""
-    if job_number is None:
-        folder = _compose(config_name, overrides, return_hydra_config=True).hydra.run.dir
-        if not folder:
-            raise UserInputError("hydra.run.dir names no folder: give it one, or leave it out")
-        return Path(folder)
-    given = [*overrides, f"hydra.job.num={job_number}"]
-    sweep = _compose(config_name, given, return_hydra_config=True).hydra.sweep
-    return Path(sweep.dir) / str(sweep.subdir)
+def output_folder(config_name: str, overrides: list[str]) -> Path:
+    """Return the folder that a run would write into."""
+    return _folder(config_name, overrides, "run")
 
 
-def _jobs(overrides: list[str]) -> list[list[str]]:
-    """Split the overrides of a multirun as Hydra's own sweeper does."""
+def sweep_folder(config_name: str, overrides: list[str]) -> Path:
+    """Return the folder that holds those of a multirun."""
+    return _folder(config_name, overrides, "sweep")
+
+
+def _folder(config_name: str, overrides: list[str], mode: str) -> Path:
+    folder = _compose(config_name, overrides, return_hydra_config=True).hydra[mode].dir
+    if not folder:
+        raise UserInputError(f"hydra.{mode}.dir names no folder: give it one, or leave it out")
+    return Path(folder)
+
+
+def combinations(overrides: list[str]) -> list[list[str]]:
+    """Split the overrides of a multirun as Hydra's own sweeper does; the last of several for one key holds."""
+    parsed = parse(overrides)
+    return [job for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
+
+
+def parse(overrides: list[str]) -> list[Override]:
+    """Read overrides.
+
+    Raises:
+        UserInputError: one sentence for what is no override.
+    """
     try:
-        parsed = OverridesParser.create().parse_overrides(overrides)
+        return OverridesParser.create().parse_overrides(overrides)
     except HydraException as error:
         raise UserInputError(_sentence(error, "", overrides)) from error
-    return [job for batch in BasicSweeper.split_arguments(parsed, max_batch_size=None) for job in batch]
 
 
 def compose(config_name: str, overrides: list[str]) -> DictConfig:

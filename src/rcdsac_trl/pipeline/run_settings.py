@@ -1,8 +1,11 @@
 """All that a training or an evaluation may choose, checked as a whole.
 
-The three outermost classes are the roots of ``conf/train.yaml``, ``conf/evaluate.yaml`` and ``conf/export.yaml``.
+Roots are :class:`TrainingSettings` (``conf/train.yaml``), :class:`EvaluationSettings` (``conf/evaluate.yaml``),
+:class:`ExportSettings` (``conf/export.yaml``) and :class:`ExperimentSettings`, what a sweep (``conf/sweep.yaml``) makes
+its runs of.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -224,3 +227,14 @@ class EvaluationSettings:
         _check_least("num_episodes", self.num_episodes, 1)
         resolve_processes(self.num_workers, self.num_maps)
         runtime.resolve_threads(self.threads)
+
+
+@dataclass(frozen=True)
+class ExperimentSettings:
+    """A set of trainings (``conf/experiment``); overrides are written as on the command line."""
+
+    name: str
+    every: tuple[str, ...]
+    runs: Mapping[str, tuple[str, ...]]
+    only: tuple[str, ...] | None
+    evaluate: tuple[str, ...] | None

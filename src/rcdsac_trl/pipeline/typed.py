@@ -21,7 +21,8 @@ def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> S
     """Make a settings dataclass of a section whose keys are its fields; a field may be a section of its own.
 
     Understood are ``bool``, ``int``, ``float`` (which takes whole numbers, and nothing infinite), ``str``,
-    ``Literal``, ``None``, tuples (from lists), dataclasses (from sections) and unions of these.
+    ``Literal``, ``None``, tuples (from lists), dataclasses (from sections), mappings from text (from sections with keys
+    of any name) and unions of these.
 
     Args:
         cls: a dataclass.
@@ -71,6 +72,10 @@ def _fit(value: Any, hint: Any, path: str) -> Any:
         if is_dataclass(option) and isinstance(option, type):
             if isinstance(value, Mapping):
                 return read(option, value, path)
+        elif get_origin(option) is Mapping:
+            if isinstance(value, Mapping):
+                each = get_args(option)[1]
+                return {str(key): _fit(below, each, _join(path, str(key))) for key, below in value.items()}
         elif _is_a(value, option):
             return tuple(value) if isinstance(value, list) else value
     wanted = " or ".join(_describe(option) for option in options)

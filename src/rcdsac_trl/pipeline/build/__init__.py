@@ -3,10 +3,12 @@
 from rcdsac_trl.pipeline.build.evaluation import evaluation
 from rcdsac_trl.pipeline.build.export import Export, export
 from rcdsac_trl.pipeline.build.resume import run_to_continue
+from rcdsac_trl.pipeline.build.sweep import check_single, sweep
 from rcdsac_trl.pipeline.build.training import check_training, failure, given_overrides, resumed, run_folder, trainer
 
 __all__ = [
     "Export",
+    "check_single",
     "check_training",
     "evaluation",
     "export",
@@ -15,5 +17,6 @@ __all__ = [
     "resumed",
     "run_folder",
     "run_to_continue",
+    "sweep",
     "trainer",
 ]

@@ -16,14 +16,14 @@ from rcdsac_trl.pipeline.logs import CONFIG_NAME, MANIFEST_NAME
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, newest
 
 AUTO = "auto"
+_ABSENT = object()
 
 
-def run_to_continue(overrides: list[str], *, multirun: bool) -> Path | None:
+def run_to_continue(overrides: list[str]) -> Path | None:
     """Find the run that a call of `train` continues.
 
     Args:
         overrides: of the command line.
-        multirun: whether it starts several runs.
 
     Returns:
         The run's folder; None if the call starts a new one.
@@ -34,8 +34,6 @@ def run_to_continue(overrides: list[str], *, multirun: bool) -> Path | None:
     """
     if not any(_key(override) == "resume" for override in overrides):
         return None
-    if multirun:
-        raise UserInputError("resume continues one run: leave -m out, or leave resume out")
     cfg = compose("train", overrides)
     if cfg.resume is None:
         return None
@@ -64,6 +62,21 @@ def _newest_unfinished(overrides: list[str]) -> Path | None:
             return folder
     print(f"resume=auto: no unfinished run of this config in {there.parent}, so a new one")
     return None
+
+
+def differing_keys(folder: Path, cfg: DictConfig) -> list[str]:
+    """Name the keys in which a run's config is another one; empty if it is the same, or the folder holds no run."""
+    if not (folder / CONFIG_NAME).exists():
+        return []
+    there, wanted = _leaves(_config(folder) or {}), _leaves(_comparable(cfg))
+    return sorted(key for key in there.keys() | wanted.keys() if there.get(key, _ABSENT) != wanted.get(key, _ABSENT))
+
+
+def _leaves(node: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in node.items():
+        found |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
 
 
 def _is_finished(folder: Path) -> bool:
