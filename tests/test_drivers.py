@@ -126,11 +126,11 @@ def test_a_process_ends_by_itself_when_the_main_one_is_killed(tmp_path: Path) ->
 
 
 def test_training_leaves_a_core_to_validation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rcdsac_trl.pipeline.drivers.cores", lambda: 4)
+    monkeypatch.setattr("rcdsac_trl.pipeline.drivers.usable_cores", lambda: 4)
     assert [resolve_processes_beside("auto", 9, threads) for threads in (1, 2, 4)] == [3, 2, 1]
     assert resolve_processes_beside("auto", 2, threads=1) == 2
     assert [resolve_processes_beside(given, 3, threads=1) for given in (0, 1, 8)] == [0, 1, 3]
-    monkeypatch.setattr("rcdsac_trl.pipeline.drivers.cores", lambda: 1)
+    monkeypatch.setattr("rcdsac_trl.pipeline.drivers.usable_cores", lambda: 1)
     assert resolve_processes_beside("auto", 9, threads=1) == 0
 
 

@@ -54,11 +54,12 @@ ARROWS = {
     "errors": set(),
     "seeding": set(),
     "paths": set(),
+    "cores": {"errors"},
     "interface": {"errors"},
-    "world": {"errors", "seeding", "interface", "world"},
+    "world": {"errors", "seeding", "cores", "interface", "world"},
     "agent": {"errors", "seeding", "agent"},
     "deploy": {"errors", "interface", "agent", "deploy"},
-    "pipeline": {"errors", "seeding", "paths", "interface", "world", "agent", "deploy", "pipeline"},
+    "pipeline": {"errors", "seeding", "paths", "cores", "interface", "world", "agent", "deploy", "pipeline"},
 }
 
 

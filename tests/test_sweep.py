@@ -143,7 +143,7 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Calls:
     monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else they start this process again
     monkeypatch.chdir(tmp_path)
 
-    def call(command: list[str], output: Path) -> int:
+    def call(command: list[str], output: Path, variables: dict[str, str]) -> int:
         assert command[:2] == [sys.executable, "-m"]
         made.append((command[2].removeprefix("rcdsac_trl."), output.parent.name))
         monkeypatch.setattr(sys, "argv", command[2:])
@@ -171,7 +171,7 @@ def states(folder: Path) -> dict[str, str]:
 
 def test_two_rows_and_two_seeds_and_the_same_call_again(calls: Calls, tmp_path: Path, capsys: Callable) -> None:
     asked = ["+algo=rcdsac_pow,sac", "seed=0,1", *SMALL, "hydra.sweep.dir=all"]
-    asked.append("experiment.evaluate=[split=validation,num_maps=1,num_episodes=1,num_workers=0]")
+    asked.append("experiment.evaluate=['split=validation','num_maps=1','num_episodes=1','num_workers=0']")
     build.sweep(asked).run()
     names = ["rcdsac_pow-narrow-s0", "rcdsac_pow-narrow-s1", "sac-narrow-s0", "sac-narrow-s1"]
     assert calls == [(verb, name) for name in names for verb in ("train", "evaluate")]
@@ -224,8 +224,8 @@ def test_a_failed_evaluation_is_done_again_without_training(
     build.sweep(asked).run()
     before = tables(tmp_path / "all")
     with pytest.raises(FaultError, match="exit code 2: there is no key num_mpas: did you mean num_maps"):
-        build.sweep([*asked, "experiment.evaluate=[num_mpas=1]"]).run()
-    build.sweep([*asked, "experiment.evaluate=[num_maps=1,num_episodes=1,num_workers=0]"]).run()
+        build.sweep([*asked, "experiment.evaluate=['num_mpas=1']"]).run()
+    build.sweep([*asked, "experiment.evaluate=['num_maps=1','num_episodes=1','num_workers=0']"]).run()
     assert tables(tmp_path / "all").items() >= before.items()
     assert [state.evaluated for _, state in runs_of(tmp_path / "all")] == [
         ("num_maps=1", "num_episodes=1", "num_workers=0")

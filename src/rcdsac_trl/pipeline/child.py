@@ -1,34 +1,43 @@
-"""A program in a process that dies with this one: what a sweep runs its jobs as."""
+"""A program in a process that ends with the one that called it: what a sweep runs its jobs as.
+
+Run as a program, this module takes the caller's process number and a command, and becomes that command. So nothing has
+to happen between fork and exec, where a caller with threads could come to a standstill.
+"""
 
 import ctypes
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _PATIENCE_S = 60
-_libc = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
-def call(command: Sequence[str], output: Path) -> int:
+def call(command: Sequence[str], output: Path, variables: Mapping[str, str]) -> int:
     """Run a program to its end; what it prints is appended to a file.
 
     On Linux it is ended if this process dies: else it would hold its run folder, and the sweep that is started
     again could not go on there. Ctrl-C, which a terminal gives to both, is waited out.
 
+    Args:
+        command: program and arguments.
+        output: the file; its folder must exist.
+        variables: added to the environment.
+
     Returns:
         The exit code; the negative number of the signal that ended it.
     """
+    started = [sys.executable, "-m", __name__, str(os.getpid()), *command]
     with output.open("ab") as file:
         process = subprocess.Popen(
-            command,
+            started,
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,
-            preexec_fn=_before_exec(os.getpid()),
+            env=os.environ | variables,
         )
         try:
             return process.wait()
@@ -46,14 +55,17 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _before_exec(parent: int) -> Callable[[], None]:
-    def prepare() -> None:
-        # By these a cluster tells of an end to come; whoever supervises sees to it, and the work goes on until then.
-        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
-        signal.signal(signal.SIGUSR2, signal.SIG_IGN)
-        if _libc is not None:
-            _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-            if os.getppid() != parent:  # it died before this was asked for
-                os._exit(1)
+def _become(caller: int, command: list[str]) -> None:
+    """Tie this process to its caller and turn it into a command; both survive the change of program."""
+    # By these a cluster tells of an end to come; whoever supervises sees to it, and the work goes on until then.
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    signal.signal(signal.SIGUSR2, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != caller:  # it died before this was asked for
+            raise SystemExit(1)
+    os.execvp(command[0], command)
 
-    return prepare
+
+if __name__ == "__main__":
+    _become(int(sys.argv[1]), sys.argv[2:])

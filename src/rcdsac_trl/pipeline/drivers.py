@@ -5,7 +5,6 @@ An evaluation waits for them (:func:`drive_maps`), a training goes on meanwhile 
 
 import contextlib
 import multiprocessing
-import os
 import signal
 import time
 from collections.abc import Callable, Generator
@@ -15,6 +14,7 @@ from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from typing import Any, Literal
 
+from rcdsac_trl.cores import usable_cores
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.world.workers import START_METHOD, WorkerError, ending
@@ -26,11 +26,6 @@ Drive = Callable[[int, Callable[[], None]], Rows]
 _PRELOADED = "rcdsac_trl.pipeline.build"
 # Seconds between two looks at Ctrl-C and at processes that say nothing, while one waits for them.
 _LOOK_S = 0.2
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def resolve_processes(num_workers: int | Literal["auto"], at_most: int, key: str = "num_workers") -> int:
@@ -49,7 +44,7 @@ def resolve_processes(num_workers: int | Literal["auto"], at_most: int, key: str
         (3, 0)
     """
     if num_workers == "auto":
-        num_workers = cores()
+        num_workers = usable_cores()
     if not isinstance(num_workers, int) or num_workers < 0:
         raise UserInputError(f"{key}={num_workers!r} is not a number of processes: give 0 or more, or auto")
     used = min(num_workers, at_most)
@@ -68,7 +63,7 @@ def resolve_processes_beside(processes: int | Literal["auto"], num_maps: int, th
         >>> resolve_processes_beside(4, num_maps=3, threads=1)
         3
     """
-    free = max(1, cores() - threads) if cores() > 1 else 0
+    free = max(1, usable_cores() - threads) if usable_cores() > 1 else 0
     return min(free if processes == "auto" else processes, num_maps)
 
 

@@ -8,6 +8,7 @@ import re
 import sys
 from contextlib import suppress
 
+from rcdsac_trl.cores import usable_cores
 from rcdsac_trl.errors import UserInputError
 
 # glibc maps and unmaps every large temporary by default, which costs more than the arithmetic on it.
@@ -83,7 +84,7 @@ def resolve_threads(threads: int | str) -> int:
         UserInputError: if there is no such number of threads.
     """
     if threads == "auto":
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return usable_cores()
     if not isinstance(threads, int) or threads < 1:
         raise UserInputError(f"threads={threads} is not a whole number of at least 1: use that or auto")
     if threads > _MAX_THREADS:

@@ -14,11 +14,12 @@ Public names::
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from rcdsac_trl.cores import SHARE
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.child import call
@@ -96,10 +97,14 @@ class Launcher(Protocol):
         """Run every job by :func:`execute`, and yield each as it ends; a job that fails stops no other."""
 
 
-def execute(job: Job) -> State:
+def execute(job: Job, cores: int | None = None) -> State:
     """Train a job and evaluate it, each in a process of its own, so that whatever happens to it happens to it alone.
 
     What they print goes to ``console.log`` in the run folder.
+
+    Args:
+        job: what to do.
+        cores: its share of this machine's; None: all of them.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -108,7 +113,7 @@ def execute(job: Job) -> State:
         return State("failed", str(error))
     job.note(State("started"))
     try:
-        state = _train_and_evaluate(job)
+        state = _train_and_evaluate(job, {} if cores is None else {SHARE: str(cores)})
     except KeyboardInterrupt:
         job.note(State("interrupted"))
         raise
@@ -116,21 +121,21 @@ def execute(job: Job) -> State:
     return state
 
 
-def _train_and_evaluate(job: Job) -> State:
+def _train_and_evaluate(job: Job, variables: Mapping[str, str]) -> State:
     folder = _quoted(job.folder)
     has_begun = (job.folder / _CONFIG).exists()
     where = [f"resume={folder}"] if has_begun else [*job.overrides, f"hydra.run.dir={folder}"]
-    if (state := _call(job, ["rcdsac_trl.train", *where])) is not None:
+    if (state := _call(job, ["rcdsac_trl.train", *where], variables)) is not None:
         return state
     if job.evaluate is not None:
-        state = _call(job, ["rcdsac_trl.evaluate", f"run={folder}", *job.evaluate])
+        state = _call(job, ["rcdsac_trl.evaluate", f"run={folder}", *job.evaluate], variables)
     return state or State("finished", evaluated=job.evaluate)
 
 
-def _call(job: Job, module: list[str]) -> State | None:
+def _call(job: Job, module: list[str], variables: Mapping[str, str]) -> State | None:
     """Run a module's main; return how the job stands if it did not succeed."""
     console = job.folder / CONSOLE
-    code = call([sys.executable, "-m", *module], console)
+    code = call([sys.executable, "-m", *module], console, variables)
     if code == 0:
         return None
     if code == _INTERRUPTED:

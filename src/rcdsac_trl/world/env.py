@@ -1,7 +1,6 @@
 """The navigation task as a TorchRL environment, in one process or over several workers."""
 
 import multiprocessing
-import os
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
@@ -12,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, SerialEnv
 
+from rcdsac_trl.cores import usable_cores
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.agents import AgentGroup
 from rcdsac_trl.world.maps import MapSettings, Split
@@ -195,7 +195,7 @@ def _torch_spec(space: Space, batch: torch.Size) -> TensorSpec:
 def resolve_num_workers(num_workers: int | Literal["auto"], num_agents: int) -> int:
     """Return the number of worker processes; see :func:`make_env`."""
     if num_workers == "auto":
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = usable_cores()
         return max(n for n in range(1, num_agents + 1) if num_agents % n == 0 and n <= cores)
     if not isinstance(num_workers, int) or num_workers < 0 or (num_workers and num_agents % num_workers):
         raise UserInputError(

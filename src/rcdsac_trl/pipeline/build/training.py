@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.agent.targets import FusedSoftUpdate
+from rcdsac_trl.cores import usable_cores
 from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.pipeline import logs, resources, runtime
 from rcdsac_trl.pipeline.build.agent import (
@@ -25,7 +26,7 @@ from rcdsac_trl.pipeline.build.collection import make_episodes
 from rcdsac_trl.pipeline.build.driver import Course, driver
 from rcdsac_trl.pipeline.build.read import settings_of_run, training_settings
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators, load_average, rotate
-from rcdsac_trl.pipeline.drivers import cores, resolve_processes_beside
+from rcdsac_trl.pipeline.drivers import resolve_processes_beside
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.guard import FiniteGuard, load_failure
 from rcdsac_trl.pipeline.replay import SequenceReplay, replay_bytes
@@ -272,7 +273,7 @@ def _validation(settings: TrainingSettings, device: str, threads: int) -> Valida
         threads=1,
     )
     beside = resolve_processes_beside(given.processes, given.num_maps, threads)
-    alone = min(cores(), given.num_maps) if given.processes == "auto" else beside
+    alone = min(usable_cores(), given.num_maps) if given.processes == "auto" else beside
     return Validation(
         partial(driver, course),
         num_maps=given.num_maps,

@@ -1,0 +1,23 @@
+"""How many cores this process may use: the one answer to every ``auto``."""
+
+import os
+
+from rcdsac_trl.errors import UserInputError
+
+SHARE = "RCDSAC_TRL_CORES"
+"""Environment variable: the share of a machine that a process and those it starts have been given."""
+
+
+def usable_cores() -> int:
+    """Return the cores this process may use: those the system lets it run on, or its share of them.
+
+    Raises:
+        UserInputError: if the share is no number.
+    """
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    share = os.environ.get(SHARE)
+    if share is None:
+        return there
+    if not share.isdecimal() or int(share) < 1:
+        raise UserInputError(f"{SHARE}={share} is not a whole number of at least 1: set it to that, or unset it")
+    return min(there, int(share))
