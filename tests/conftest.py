@@ -1,5 +1,9 @@
 """Shared by all tests."""
 
+import sys
+import traceback
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -17,3 +21,30 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tiny") / "run"
     tiny_trainer(folder, "rcdsac_pow", "logger=default").run()
     return folder
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, str]]:
+    """Run the jobs of sweeps and searches in this process, as the programs they are, and list them."""
+    from rcdsac_trl.pipeline import sweep
+
+    made: list[tuple[str, str]] = []
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else they start this process again
+    monkeypatch.chdir(tmp_path)
+
+    def call(command: list[str], output: Path, variables: dict[str, str], should_stop: object) -> int:
+        assert command[:2] == [sys.executable, "-m"]
+        made.append((command[2].removeprefix("rcdsac_trl."), output.parent.name))
+        monkeypatch.setattr(sys, "argv", command[2:])
+        with output.open("a") as file, redirect_stdout(file), redirect_stderr(file):
+            try:
+                import_module(command[2]).main()
+            except SystemExit as left:
+                return int(left.code or 0)
+            except Exception:
+                traceback.print_exc()
+                return 1
+        return 0
+
+    monkeypatch.setattr(sweep, "call", call)
+    return made

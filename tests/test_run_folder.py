@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -12,8 +11,7 @@ import pytest
 import yaml
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline import logs
-from rcdsac_trl.pipeline.cli import output_folder, precheck
+from rcdsac_trl.pipeline.cli import output_folder
 from rcdsac_trl.pipeline.saved import newest
 from tiny import AGENTS, ITERATIONS, TINY, tiny_trainer
 
@@ -24,7 +22,6 @@ STARTER = """
 import sys, time
 from pathlib import Path
 from rcdsac_trl import train
-from rcdsac_trl.pipeline import logs
 
 mine, other = Path(sys.argv.pop(1)), Path(sys.argv.pop(1))
 check_folder = logs.check_folder
@@ -103,30 +100,3 @@ def test_a_lock_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:
 def test_runs_started_in_the_same_second_get_folders_of_their_own() -> None:
     given = ["+algo=rcdsac_pow"]
     assert len({output_folder("train", given) for _ in range(3)}) == 3
-
-
-@pytest.fixture
-def multirun(tmp_path: Path) -> Callable[..., None]:
-    def check(*arguments: str) -> None:
-        given = ["-m", "+algo=sac", "seed=0,1", f"hydra.sweep.dir={tmp_path}", *arguments]
-        precheck("train", given, lambda cfg: None, logs.check_folder)
-
-    return check
-
-
-def test_no_job_of_a_multirun_starts_if_one_of_their_folders_is_taken(
-    multirun: Callable[..., None], tmp_path: Path
-) -> None:
-    multirun()
-    taken = tmp_path / "1-sac-narrow-s1"
-    taken.mkdir()
-    (taken / "config.yaml").touch()
-    with pytest.raises(UserInputError, match=f"^{taken} already holds a run: choose another"):
-        multirun()
-    multirun("hydra.sweep.subdir=other-${hydra.job.num}")
-
-
-def test_jobs_of_a_multirun_never_share_a_folder(multirun: Callable[..., None], tmp_path: Path) -> None:
-    told = f"^{tmp_path}/a-sac would hold several of these runs: put what differs into hydra.sweep.subdir$"
-    with pytest.raises(UserInputError, match=told):
-        multirun("hydra.sweep.subdir=a-${algo.name}")

@@ -1,15 +1,17 @@
 """Real trainings that take about a second, for the tests of the pipeline."""
 
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
+import pytest
 import yaml
 from omegaconf import DictConfig
 
 from rcdsac_trl.paths import CONF_DIR
 from rcdsac_trl.pipeline import build
 from rcdsac_trl.pipeline.build.read import training_settings
-from rcdsac_trl.pipeline.cli import compose
+from rcdsac_trl.pipeline.cli import combinations, compose
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.trainer import Trainer
 
@@ -38,6 +40,12 @@ TINY = [
     "threads=1",
     "logger=none",
 ]
+
+SMALL = [*TINY, "network={conv: 4, range: 8, vector: 4, memory: 8, head: 8, cosines: 4}", "schedule.iterations=1"]
+"""As small as a training gets."""
+
+Calls = list[tuple[str, str]]
+"""Verb and run folder of the programs that a sweep has called."""
 
 
 @cache
@@ -81,3 +89,9 @@ def yaml_of(path: str) -> dict:
     """Read one file of conf/."""
     values: dict = yaml.safe_load((CONF_DIR / path).read_text())
     return values
+
+
+def first_combinations_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the first combination of each run of a sweep stand for the others."""
+    module = import_module("rcdsac_trl.pipeline.build.sweep")
+    monkeypatch.setattr(module, "combinations", lambda overrides: combinations(overrides)[:1])

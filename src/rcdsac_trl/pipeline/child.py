@@ -9,14 +9,20 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _PATIENCE_S = 60
+_POLL_S = 1.0
+STOPPED = 1000
+"""What :func:`call` returns for a program that was stopped on purpose: no exit code is as large."""
 
 
-def call(command: Sequence[str], output: Path, variables: Mapping[str, str]) -> int:
+def call(
+    command: Sequence[str], output: Path, variables: Mapping[str, str], should_stop: Callable[[], bool] | None = None
+) -> int:
     """Run a program to its end; what it prints is appended to a file.
 
     On Linux it is ended if this process dies: else it would hold its run folder, and the sweep that is started
@@ -26,9 +32,10 @@ def call(command: Sequence[str], output: Path, variables: Mapping[str, str]) -> 
         command: program and arguments.
         output: the file; its folder must exist.
         variables: added to the environment.
+        should_stop: asked about every second; once it says so, the program is ended.
 
     Returns:
-        The exit code; the negative number of the signal that ended it.
+        The exit code; the negative number of the signal that ended it; :data:`STOPPED`.
     """
     started = [sys.executable, "-m", __name__, str(os.getpid()), *command]
     with output.open("ab") as file:
@@ -40,10 +47,20 @@ def call(command: Sequence[str], output: Path, variables: Mapping[str, str]) -> 
             env=os.environ | variables,
         )
         try:
-            return process.wait()
+            return process.wait() if should_stop is None else _watch(process, should_stop)
         except BaseException:
             _end(process)
             raise
+
+
+def _watch(process: subprocess.Popen[bytes], should_stop: Callable[[], bool]) -> int:
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            return process.wait(timeout=_POLL_S)
+        if should_stop():
+            process.terminate()
+            process.wait()
+            return STOPPED
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -5,7 +5,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import NoReturn
 
@@ -58,24 +58,51 @@ def entry_point(
             except Exception as error:
                 _fail_or_raise(error)
 
-        def main() -> None:
-            keep_pages()
-            quiet_libraries()
-            try:
-                asked = read_arguments(sys.argv[1:])
-                if instead is not None and asked is not None and instead(asked.overrides, asked.multirun):
-                    return
-                precheck(config_name, sys.argv[1:], check, check_folder)
-                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
-            except KeyboardInterrupt:
-                print("rcdsac_trl: interrupted", file=sys.stderr)
-                raise SystemExit(INTERRUPTED) from None
-            except Exception as error:
-                _fail_or_raise(error)
+        def started() -> None:
+            asked = read_arguments(sys.argv[1:])
+            if instead is not None and asked is not None and instead(asked.overrides, asked.multirun):
+                return
+            precheck(config_name, sys.argv[1:], check, check_folder)
+            hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
 
-        return main
+        return partial(_program, started)
 
     return decorate
+
+
+def overrides_entry_point(config_name: str) -> Callable[[Callable[[list[str]], None]], Callable[[], None]]:
+    """Make a main of a task that composes for itself, since its overrides are meant for more than one config.
+
+    Args:
+        config_name: the root config that ``--help`` and the like show.
+    """
+
+    def decorate(task: Callable[[list[str]], None]) -> Callable[[], None]:
+        def started() -> None:
+            asked = read_arguments(sys.argv[1:])
+            if asked is None:
+                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(lambda cfg: None)()
+            elif asked.multirun:
+                raise UserInputError("-m is for `train`: leave it out")
+            else:
+                task(asked.overrides)
+
+        return partial(_program, started)
+
+    return decorate
+
+
+def _program(started: Callable[[], None]) -> None:
+    """Do what a program does, so that a mistake, a fault and Ctrl-C each end it as its users expect."""
+    keep_pages()
+    quiet_libraries()
+    try:
+        started()
+    except KeyboardInterrupt:
+        print("rcdsac_trl: interrupted", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+    except Exception as error:
+        _fail_or_raise(error)
 
 
 def fail(error: UserInputError | FaultError) -> NoReturn:

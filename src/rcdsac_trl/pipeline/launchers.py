@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any, Literal
 
 from rcdsac_trl.cores import usable_cores
-from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.pipeline.sweep import Job, Launcher, State, execute
 from rcdsac_trl.pipeline.typed import read
 
@@ -40,8 +40,11 @@ def _check_least(settings: object, lowest: int, *keys: str) -> None:
 
 def _fault(error: BaseException) -> State:
     """Say that an engine lost a job: its machine went down, it was cancelled or refused."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return State("failed", f"{type(error).__name__}: {lines[0]}")
+    return State("failed", f"{type(error).__name__}: {_first_line(error)}")
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 @dataclass(frozen=True)
@@ -114,27 +117,30 @@ class SlurmLauncher:
         """Run every job, see :class:`~rcdsac_trl.pipeline.sweep.Launcher`."""
         submitit = _engine("submitit")
         logs = jobs[0].folder.parent / ".submitit" / "%j"
-        executor = submitit.AutoExecutor(folder=logs, cluster=self.cluster, slurm_max_num_timeout=self.requeues)
-        given = {"slurm_partition": self.partition, "slurm_account": self.account}
-        executor.update_parameters(
-            name="rcdsac_trl",
-            timeout_min=self.timeout_min,
-            nodes=1,
-            tasks_per_node=1,
-            cpus_per_task=self.cores_per_run,
-            gpus_per_node=self.gpus_per_run,
-            mem_gb=self.mem_gb,
-            slurm_array_parallelism=self.runs_at_once,
-            slurm_setup=list(self.setup),
-            slurm_additional_parameters=dict(option.split("=", 1) for option in self.sbatch),
-            **{key: value for key, value in given.items() if value is not None},
-        )
-        submitted = executor.map_array(Requeued(self.cores_per_run), list(jobs))
+        try:
+            executor = submitit.AutoExecutor(folder=logs, cluster=self.cluster, slurm_max_num_timeout=self.requeues)
+            given = {"slurm_partition": self.partition, "slurm_account": self.account}
+            executor.update_parameters(
+                name="rcdsac_trl",
+                timeout_min=self.timeout_min,
+                nodes=1,
+                tasks_per_node=1,
+                cpus_per_task=self.cores_per_run,
+                gpus_per_node=self.gpus_per_run,
+                mem_gb=self.mem_gb,
+                slurm_array_parallelism=self.runs_at_once,
+                slurm_setup=list(self.setup),
+                slurm_additional_parameters=dict(option.split("=", 1) for option in self.sbatch),
+                **{key: value for key, value in given.items() if value is not None},
+            )
+            submitted = executor.map_array(Requeued(self.cores_per_run), list(jobs))
+        except Exception as error:  # whatever submitit and SLURM find to say
+            raise FaultError(f"launcher=slurm: {_first_line(error)}") from error
         of = dict(zip(submitted, jobs, strict=True))
         print(f"submitted {len(jobs)} jobs to {self.cluster}; their logs: {logs.parent}", flush=True)
         for ended in submitit.helpers.as_completed(submitted, poll_frequency=2):
-            error = ended.exception()
-            yield of[ended], ended.result() if error is None else _fault(error)
+            lost = ended.exception()
+            yield of[ended], ended.result() if lost is None else _fault(lost)
 
 
 class Requeued:
@@ -175,7 +181,10 @@ class RayLauncher:
         """Run every job, see :class:`~rcdsac_trl.pipeline.sweep.Launcher`."""
         ray = _engine("ray")
         own = {"num_cpus": usable_cores(), "include_dashboard": False} if self.address is None else {}
-        ray.init(address=self.address or "local", log_to_driver=False, **own)
+        try:
+            ray.init(address=self.address or "local", log_to_driver=False, **own)
+        except Exception as error:
+            raise FaultError(f"launcher.address={self.address}: {_first_line(error)}") from error
         try:
             task = ray.remote(num_cpus=self.cores_per_run, num_gpus=self.gpus_per_run)(execute)
             waiting = {task.remote(job, self.cores_per_run): job for job in jobs}

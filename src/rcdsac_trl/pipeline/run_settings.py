@@ -238,3 +238,26 @@ class ExperimentSettings:
     runs: Mapping[str, tuple[str, ...]]
     only: tuple[str, ...] | None
     evaluate: tuple[str, ...] | None
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """A search for better hyper-parameters (``conf/search.yaml``)."""
+
+    name: str
+    trials: int
+    collision_cost: float
+    averaged_validations: int
+    startup_trials: int
+    warmup_iterations: int
+    seed: int
+    storage: str | None
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit."""
+        for key in ("trials", "averaged_validations"):
+            _check_least(f"search.{key}", getattr(self, key), 1)
+        for key in ("startup_trials", "warmup_iterations", "seed"):
+            _check_least(f"search.{key}", getattr(self, key), 0)
+        if self.collision_cost < 0:
+            raise UserInputError(f"search.collision_cost={self.collision_cost:g} must be at least 0")

@@ -14,7 +14,7 @@ Public names::
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -22,7 +22,7 @@ from typing import Any, Literal, Protocol
 from rcdsac_trl.cores import SHARE
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.pipeline import durable
-from rcdsac_trl.pipeline.child import call
+from rcdsac_trl.pipeline.child import STOPPED, call
 
 INDEX = "sweep.json"
 STATE = "state.json"
@@ -39,12 +39,13 @@ class State:
 
     Attributes:
         name: ``waiting`` (nobody has begun it), ``started`` (it is running, or was when its machine went down),
-            ``interrupted`` (by Ctrl-C), ``failed`` or ``finished`` (evaluated too, if that was asked for).
+            ``interrupted`` (by Ctrl-C), ``stopped`` (a search gave it up), ``failed`` or ``finished`` (evaluated too,
+            if that was asked for).
         sentence: why it failed.
         evaluated: overrides of the evaluation that is done.
     """
 
-    name: Literal["waiting", "started", "interrupted", "failed", "finished"]
+    name: Literal["waiting", "started", "interrupted", "stopped", "failed", "finished"]
     sentence: str | None = None
     evaluated: tuple[str, ...] | None = None
 
@@ -97,7 +98,7 @@ class Launcher(Protocol):
         """Run every job by :func:`execute`, and yield each as it ends; a job that fails stops no other."""
 
 
-def execute(job: Job, cores: int | None = None) -> State:
+def execute(job: Job, cores: int | None = None, should_stop: Callable[[], bool] | None = None) -> State:
     """Train a job and evaluate it, each in a process of its own, so that whatever happens to it happens to it alone.
 
     What they print goes to ``console.log`` in the run folder.
@@ -105,6 +106,7 @@ def execute(job: Job, cores: int | None = None) -> State:
     Args:
         job: what to do.
         cores: its share of this machine's; None: all of them.
+        should_stop: asked again and again while it trains; once it says so, the job is stopped.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -113,7 +115,7 @@ def execute(job: Job, cores: int | None = None) -> State:
         return State("failed", str(error))
     job.note(State("started"))
     try:
-        state = _train_and_evaluate(job, {} if cores is None else {SHARE: str(cores)})
+        state = _train_and_evaluate(job, {} if cores is None else {SHARE: str(cores)}, should_stop)
     except KeyboardInterrupt:
         job.note(State("interrupted"))
         raise
@@ -121,25 +123,29 @@ def execute(job: Job, cores: int | None = None) -> State:
     return state
 
 
-def _train_and_evaluate(job: Job, variables: Mapping[str, str]) -> State:
+def _train_and_evaluate(job: Job, variables: Mapping[str, str], should_stop: Callable[[], bool] | None) -> State:
     folder = _quoted(job.folder)
     has_begun = (job.folder / _CONFIG).exists()
     where = [f"resume={folder}"] if has_begun else [*job.overrides, f"hydra.run.dir={folder}"]
-    if (state := _call(job, ["rcdsac_trl.train", *where], variables)) is not None:
+    if (state := _call(job, ["rcdsac_trl.train", *where], variables, should_stop)) is not None:
         return state
     if job.evaluate is not None:
         state = _call(job, ["rcdsac_trl.evaluate", f"run={folder}", *job.evaluate], variables)
     return state or State("finished", evaluated=job.evaluate)
 
 
-def _call(job: Job, module: list[str], variables: Mapping[str, str]) -> State | None:
+def _call(
+    job: Job, module: list[str], variables: Mapping[str, str], should_stop: Callable[[], bool] | None = None
+) -> State | None:
     """Run a module's main; return how the job stands if it did not succeed."""
     console = job.folder / CONSOLE
-    code = call([sys.executable, "-m", *module], console, variables)
+    code = call([sys.executable, "-m", *module], console, variables, should_stop)
     if code == 0:
         return None
     if code == _INTERRUPTED:
         return State("interrupted")
+    if code == STOPPED:
+        return State("stopped")
     ended = f"exit code {code}" if code > 0 else f"killed by signal {-code}"
     return State("failed", f"{ended}: {_last_line(console)}")
 

@@ -3,6 +3,7 @@
 from rcdsac_trl.pipeline.build.evaluation import evaluation
 from rcdsac_trl.pipeline.build.export import Export, export
 from rcdsac_trl.pipeline.build.resume import run_to_continue
+from rcdsac_trl.pipeline.build.search import search
 from rcdsac_trl.pipeline.build.sweep import check_single, sweep
 from rcdsac_trl.pipeline.build.training import check_training, failure, given_overrides, resumed, run_folder, trainer
 
@@ -17,6 +18,7 @@ __all__ = [
     "resumed",
     "run_folder",
     "run_to_continue",
+    "search",
     "sweep",
     "trainer",
 ]
