@@ -9,8 +9,9 @@ from omegaconf import OmegaConf
 
 from rcdsac_trl import draw_maps
 from rcdsac_trl.paths import CONF_DIR
-from rcdsac_trl.pipeline.build import check_training
+from rcdsac_trl.pipeline import build
 from rcdsac_trl.pipeline.cli import compose
+from tiny import first_combinations_only
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
@@ -36,21 +37,26 @@ def commands() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("verb", "arguments"), commands())
-def test_commands_are_accepted(verb: str, arguments: str) -> None:
+def test_commands_are_accepted(verb: str, arguments: str, monkeypatch: pytest.MonkeyPatch) -> None:
     overrides = shlex.split(arguments)
-    if "-m" in overrides:  # the first of all combinations stands for the others
-        overrides = [override.split(",")[0] for override in overrides if override != "-m"]
+    if verb == "search":
+        build.search(overrides)
+        return
+    if "-m" in overrides:  # of each named run its first combination stands for the others
+        first_combinations_only(monkeypatch)
+        build.sweep([override for override in overrides if override != "-m"])
+        return
     overrides = [override.replace(NEW_ROW, "rcdsac_pow") for override in overrides]
     cfg = compose(verb, overrides)
     if verb == "train":
-        check_training(cfg)
+        build.check_training(cfg)
     elif verb == "draw_maps":
         draw_maps.check(cfg)
 
 
 def test_there_are_commands_of_every_verb() -> None:
     verbs = {text.split()[0] for _, text in texts(r"python -m rcdsac_trl\.(\w+ [^\n`]+)")}
-    assert verbs == {"train", "evaluate", "export", "plot_training", "draw_maps"}
+    assert verbs == {"train", "evaluate", "export", "plot_training", "draw_maps", "search"}
 
 
 @pytest.mark.parametrize(("name", "target"), texts(r"\]\((?!https?:)([^)#]+)"))
@@ -78,6 +84,6 @@ def test_named_keys_exist() -> None:
 
 def test_every_row_and_choice_is_named() -> None:
     running = (ROOT / "docs" / "running.md").read_text()
-    for group in ("algo", "algo/distortion", "preset", "sensor", "map", "task", "logger"):
+    for group in ("algo", "algo/distortion", "preset", "sensor", "map", "task", "logger", "experiment", "launcher"):
         for path in (CONF_DIR / group).glob("*.yaml"):
             assert f"`{path.stem}`" in running, f"{group}={path.stem}"
