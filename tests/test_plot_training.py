@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from rcdsac_trl import draw_maps
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.metrics import METRICS
@@ -113,3 +114,50 @@ def test_refuses_what_it_cannot_draw(run: Path, tmp_path: Path) -> None:
     (run / "training_episodes.csv").unlink()
     refused(r"holds no training_episodes\.csv", f"run={run}")
     assert [path.name for path in run.iterdir()] == ["config.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("config.yaml", bytes(range(256)), r"config\.yaml cannot be read \(.*decode.*\): name a folder"),
+        ("config.yaml", b"algo: 3", r"config\.yaml cannot be read \("),
+        ("config.yaml", b"", r"config\.yaml cannot be read \("),
+        ("training_episodes.csv", b"", r"training_episodes\.csv cannot be read \(No columns"),
+        ("training_episodes.csv", b"a,b\n1,2\n", r"training_episodes\.csv cannot be read \(no column updates"),
+        ("training_episodes.csv", bytes(range(256)), r"training_episodes\.csv cannot be read \("),
+        ("validation_episodes.csv", b"updates\n1\n2,3", r"validation_episodes\.csv cannot be read \(Error tokenizing"),
+    ],
+)
+def test_a_damaged_run_is_refused_in_one_sentence(run: Path, name: str, content: bytes, told: str) -> None:
+    (run / name).write_bytes(content)
+    with pytest.raises(UserInputError, match=told):
+        check(compose("plot_training", [f"run={run}"]))
+
+
+@pytest.mark.parametrize("name", ["training_episodes.csv", "validation_episodes.csv"])
+def test_a_table_without_rows_or_with_words_is_refused(run: Path, name: str) -> None:
+    (TWO_BETAS if "validation" in name else TRAINING)[:0].to_csv(run / name, index=False)
+    with pytest.raises(UserInputError, match=f"{name} holds no episode: wait for one"):
+        check(compose("plot_training", [f"run={run}"]))
+    text = (TWO_BETAS if "validation" in name else TRAINING).to_csv(index=False)
+    (run / name).write_text(text.replace("\n0.5", "\nx"))
+    assert (run / name).read_text() != text
+    with pytest.raises(UserInputError, match=f"{name} cannot be read .*could not convert"):
+        check(compose("plot_training", [f"run={run}"]))
+
+
+@pytest.mark.parametrize(
+    ("out", "told"),
+    [
+        ("/proc/x.png", "nothing can be written into /proc "),
+        ("/dev/null/x.png", "/dev/null cannot be a folder"),
+        ("x" * 300 + ".png", "cannot be a file .File name too long.: give another"),
+        ("{run}/taken.png", "taken.png is a folder: give a file"),
+    ],
+)
+def test_a_picture_that_cannot_be_written_is_refused(run: Path, out: str, told: str) -> None:
+    (run / "taken.png").mkdir()
+    out = out.replace("{run}", str(run))
+    for verb, overrides in ((check, ["plot_training", f"run={run}"]), (draw_maps.check, ["draw_maps"])):
+        with pytest.raises(UserInputError, match=told):
+            verb(compose(overrides[0], [*overrides[1:], f"out={out}"]))

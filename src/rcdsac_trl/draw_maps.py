@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.pipeline.resources import check_picture
 from rcdsac_trl.pipeline.typed import read
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
@@ -58,8 +59,7 @@ class Sheet:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
-        if Path(str(self.out)).suffix != ".png":
-            raise UserInputError(f"out={self.out} does not name a PNG file: end it in .png")
+        check_picture(Path(self.out))
         if not isinstance(self.count, int) or not 1 <= self.count <= _MAX_COUNT:
             raise UserInputError(f"count={self.count} is not a whole number from 1 to {_MAX_COUNT}: use one")
         if self.split not in SPLITS:

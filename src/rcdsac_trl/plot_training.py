@@ -6,6 +6,7 @@ which are driven with exploration and with betas of all kinds. It may leave the 
 while: a few disastrous iterations at the start would flatten all that follows.
 """
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,10 +18,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.pipeline.logs import CONFIG_NAME, TRAINING_TABLE
 from rcdsac_trl.pipeline.metrics import validation_score
+from rcdsac_trl.pipeline.resources import check_picture
 
 PANELS: Mapping[str, str] = {
     "reward": "reward per episode",
@@ -118,17 +123,48 @@ def learning_curve(title: str, training: pd.DataFrame, validation: pd.DataFrame 
 
 
 def draw_run(folder: Path, out: Path) -> None:
-    """Write the figure of a run folder as a PNG file."""
-    trained = OmegaConf.load(folder / "config.yaml")
-    validation = folder / "validation_episodes.csv"
-    figure = learning_curve(
-        f"{trained.algo.name}, sensor {trained.sensor.name}, seed {trained.seed}",
-        pd.read_csv(folder / "training_episodes.csv"),
-        pd.read_csv(validation) if validation.is_file() else None,
-        trained.task.episode_steps,
-    )
+    """Write the figure of a run folder as a PNG file.
+
+    Raises:
+        UserInputError: if the folder holds no run, or its config or tables cannot be read.
+    """
+    figure = learning_curve(*_read_run(folder))
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=130)
+
+
+def _read_run(folder: Path) -> tuple[str, pd.DataFrame, pd.DataFrame | None, int]:
+    """Read what :func:`learning_curve` draws."""
+    path = folder / CONFIG_NAME
+    try:
+        # Not the settings: the few keys that are shown are those of runs of earlier versions too.
+        trained = OmegaConf.load(path)
+        title = f"{trained.algo.name}, sensor {trained.sensor.name}, seed {trained.seed}"
+        episode_steps = int(trained.task.episode_steps)
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())
+        raise UserInputError(f"{path} cannot be read ({reason}): name a folder that training wrote") from error
+    validation = folder / "validation_episodes.csv"
+    return (
+        title,
+        _read_table(folder / TRAINING_TABLE, ["updates", *PANELS]),
+        _read_table(validation, ["updates", *_CONDITIONS, *PANELS]) if validation.is_file() else None,
+        episode_steps,
+    )
+
+
+def _read_table(path: Path, columns: list[str]) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(path)
+        if missing := [name for name in columns if name not in table]:
+            raise ValueError(f"no column {missing[0]}")
+        table = table[columns].astype(float)
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise UserInputError(f"{path} cannot be read ({reason}): name a run whose tables are whole") from error
+    if table.empty:
+        raise UserInputError(f"{path} holds no episode: wait for one, or name another run")
+    return table
 
 
 def _means(episodes: pd.DataFrame) -> pd.DataFrame:
@@ -196,8 +232,8 @@ def _run_folder(cfg: DictConfig) -> Path:
     if cfg.run is None:
         raise UserInputError("name what to draw: run=<folder> that training wrote")
     folder = Path(str(cfg.run))
-    for name in ("config.yaml", "training_episodes.csv"):
-        if not (folder / name).is_file():
+    for name in (CONFIG_NAME, TRAINING_TABLE):
+        if not os.path.isfile(folder / name):  # false for a name that is too long, too
             raise UserInputError(
                 f"run={folder} holds no {name}: name a folder that training wrote, after its first iteration"
             )
@@ -206,14 +242,13 @@ def _run_folder(cfg: DictConfig) -> Path:
 
 def _picture(cfg: DictConfig) -> Path:
     out = Path(cfg.run) / "learning_curve.png" if cfg.out is None else Path(str(cfg.out))
-    if out.suffix != ".png":
-        raise UserInputError(f"out={out} does not name a PNG file: end it in .png")
+    check_picture(out)
     return out
 
 
 def check(cfg: DictConfig) -> None:
     """Refuse what cannot be drawn, before anything is written."""
-    _run_folder(cfg)
+    _read_run(_run_folder(cfg))
     _picture(cfg)
 
 

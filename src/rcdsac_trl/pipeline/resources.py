@@ -64,6 +64,23 @@ def check_writable(folder: Path) -> None:
         ) from error
 
 
+def check_picture(out: Path) -> None:
+    """Refuse what is no PNG file, or cannot be written.
+
+    Raises:
+        UserInputError: naming the file.
+    """
+    if out.suffix != ".png":
+        raise UserInputError(f"out={out} does not name a PNG file: end it in .png")
+    check_writable(out.parent)
+    try:
+        taken = out.is_dir()
+    except OSError as error:  # such as a name that is too long
+        raise UserInputError(f"out={out} cannot be a file ({error.strerror}): give another") from error
+    if taken:
+        raise UserInputError(f"out={out} is a folder: give a file")
+
+
 def available_memory_bytes() -> int | None:
     """Return how much memory and swap this process can still take; None where the system does not say (not Linux)."""
     found = []
