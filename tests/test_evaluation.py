@@ -97,7 +97,7 @@ def test_it_refuses_to_overwrite_another_evaluation(run: Path, tmp_path: Path) -
     before = contents(out)
     for other in (["beta=[-2]"], ["beta=[-1]", "seed=1"], ["beta=[-1]", "checkpoint=last"]):
         with pytest.raises(
-            UserInputError, match="holds an evaluation of something else: give another folder with out="
+            UserInputError, match="holds the evaluation of something else: give another folder with out="
         ):
             evaluate(f"run={run}", *other, f"out={out}")
     assert contents(out) == before

@@ -49,6 +49,11 @@ def room_of(module: str) -> str:
     return parts[0]
 
 
+def is_entry_point(module: str) -> bool:
+    """Tell whether a file is a command: it lies beside the rooms, or is what running a room runs."""
+    return room_of(module) not in ARROWS or module == "report/__main__.py"
+
+
 # What each room, and each file beside them that serves all, may import of the package.
 ARROWS = {
     "errors": set(),
@@ -60,6 +65,7 @@ ARROWS = {
     "agent": {"errors", "seeding", "agent"},
     "deploy": {"errors", "interface", "agent", "deploy"},
     "pipeline": {"errors", "seeding", "paths", "cores", "interface", "world", "agent", "deploy", "pipeline"},
+    "report": {"errors", "report"},
 }
 
 
@@ -68,17 +74,26 @@ def test_arrows_go_down(module: str) -> None:
     imported = set(imported_modules(SOURCE / module))
     ours = {room_of(name) for name in imported if name.startswith("rcdsac_trl.")}
     room = room_of(module)
-    if room in ARROWS:
+    if is_entry_point(module):  # nothing else imports it
+        assert ours <= {"errors", "seeding", "interface", "world", "agent", "deploy", "pipeline", "report", room}
+    else:
         assert ours <= ARROWS[room]
-    else:  # an entry point, which nothing else imports
-        assert ours <= {"errors", "seeding", "interface", "world", "agent", "deploy", "pipeline", room}
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if module.startswith("report/")])
+def test_reports_are_written_without_torch(module: str) -> None:
+    libraries = {name.split(".")[0] for name in imported_modules(SOURCE / module)}
+    assert not libraries & {"torch", "torchrl", "tensordict", "pybullet"}
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_only_the_builders_read_the_config(module: str) -> None:
     config_libraries = {name.split(".")[0] for name in imported_modules(SOURCE / module)} & {"hydra", "omegaconf"}
-    is_entry_point = "/" not in module
-    may = is_entry_point or module.startswith("pipeline/build/") or module in ("pipeline/cli.py", "pipeline/logs.py")
+    may = (
+        is_entry_point(module)
+        or module.startswith("pipeline/build/")
+        or module in ("pipeline/cli.py", "pipeline/logs.py")
+    )
     assert may or not config_libraries
 
 
@@ -183,6 +198,8 @@ def test_every_key_of_the_configuration_is_explained() -> None:
         "train.yaml",
         "evaluate.yaml",
         "export.yaml",
+        "calibrate.yaml",
+        "report.yaml",
         "draw_maps.yaml",
         "plot_training.yaml",
         "search.yaml",

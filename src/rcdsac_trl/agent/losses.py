@@ -223,6 +223,11 @@ class DistributionalSACLoss(LinkedLoss):
         return [*keys, "quantile_spread"] if self._distributional else keys
 
     @property
+    def critics(self) -> tuple[TensorDictSequential, ...]:
+        """The critics, each an encoder and a head that hold the loss's parameters."""
+        return self._critics
+
+    @property
     def _distributional(self) -> bool:
         return self.tensor_keys.tau in self._critics[0][1].in_keys
 

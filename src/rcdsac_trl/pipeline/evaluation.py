@@ -88,6 +88,25 @@ def _holds_another(path: Path, described: str) -> bool:
         return True
 
 
+def check_out(out: Path, name: str, described: str) -> None:
+    """Refuse a folder that cannot take results, or holds those of something else.
+
+    Args:
+        out: the folder; it need not exist.
+        name: file in it that says what its results are of.
+        described: what that file would say.
+
+    Raises:
+        UserInputError: as said.
+    """
+    if os.path.exists(out) and not out.is_dir():
+        raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
+    check_writable(out)
+    path = out / name
+    if path.exists() and _holds_another(path, described):
+        raise UserInputError(f"{out} holds the {path.stem} of something else: give another folder with out=<folder>")
+
+
 class EvaluationRun:
     """An evaluation and the folder it writes: ``episodes.csv``, ``summary.csv`` and ``evaluation.json``.
 
@@ -113,12 +132,7 @@ class EvaluationRun:
         self.described = json.dumps(described, indent=2) + "\n"
         self.num_maps = num_maps
         self.maps = maps
-        if os.path.exists(out) and not out.is_dir():
-            raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
-        check_writable(out)
-        path = out / "evaluation.json"
-        if path.exists() and _holds_another(path, self.described):
-            raise UserInputError(f"{out} holds an evaluation of something else: give another folder with out=<folder>")
+        check_out(out, "evaluation.json", self.described)
 
     def run(self) -> None:
         """Drive, write, and print the summary."""

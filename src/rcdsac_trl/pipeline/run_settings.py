@@ -1,8 +1,7 @@
-"""All that a training or an evaluation may choose, checked as a whole.
+"""All that a training, an evaluation or a calibration may choose, checked as a whole.
 
-Roots are :class:`TrainingSettings` (``conf/train.yaml``), :class:`EvaluationSettings` (``conf/evaluate.yaml``),
-:class:`ExportSettings` (``conf/export.yaml``) and :class:`ExperimentSettings`, what a sweep (``conf/sweep.yaml``) makes
-its runs of.
+The outermost classes are the roots of ``train.yaml``, ``evaluate.yaml``, ``calibrate.yaml``, ``export.yaml`` and
+``search.yaml`` in ``conf/``; :class:`ExperimentSettings` is what a sweep (``sweep.yaml``) makes its runs of.
 """
 
 from collections.abc import Mapping
@@ -261,3 +260,29 @@ class SearchSettings:
             _check_least(f"search.{key}", getattr(self, key), 0)
         if self.collision_cost < 0:
             raise UserInputError(f"search.collision_cost={self.collision_cost:g} must be at least 0")
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """The root of ``conf/calibrate.yaml``."""
+
+    run: str | None
+    beta: tuple[float, ...] | None
+    checkpoint: Literal["best", "last"]
+    split: Literal["evaluation", "validation"]
+    seed: int
+    num_maps: int
+    num_states: int
+    num_rollouts: int
+    horizon_steps: int
+    out: str | None
+    num_workers: Workers
+    threads: Threads
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit."""
+        _check_least("seed", self.seed, 0)
+        for key in ("num_maps", "num_states", "num_rollouts"):
+            _check_least(key, getattr(self, key), 1)
+        resolve_processes(self.num_workers, self.num_maps)
+        runtime.resolve_threads(self.threads)

@@ -1,5 +1,6 @@
 """From the config to objects: the only package that reads ``cfg``."""
 
+from rcdsac_trl.pipeline.build.calibration import calibration
 from rcdsac_trl.pipeline.build.evaluation import evaluation
 from rcdsac_trl.pipeline.build.export import Export, export
 from rcdsac_trl.pipeline.build.resume import run_to_continue
@@ -9,6 +10,7 @@ from rcdsac_trl.pipeline.build.training import check_training, failure, given_ov
 
 __all__ = [
     "Export",
+    "calibration",
     "check_single",
     "check_training",
     "evaluation",

@@ -14,7 +14,13 @@ from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import choices
 from rcdsac_trl.pipeline.logs import CONFIG_NAME
-from rcdsac_trl.pipeline.run_settings import EvaluationSettings, ExportSettings, SensorSettings, TrainingSettings
+from rcdsac_trl.pipeline.run_settings import (
+    CalibrationSettings,
+    EvaluationSettings,
+    ExportSettings,
+    SensorSettings,
+    TrainingSettings,
+)
 from rcdsac_trl.pipeline.settings import AlgoSettings
 from rcdsac_trl.pipeline.typed import read
 from rcdsac_trl.world.task import TaskSettings
@@ -44,6 +50,15 @@ def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
         UserInputError: for whatever it holds that cannot work.
     """
     return read(EvaluationSettings, _plain(cfg))
+
+
+def calibration_settings(cfg: DictConfig) -> CalibrationSettings:
+    """Read the config of a calibration.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(CalibrationSettings, _plain(cfg))
 
 
 def export_settings(cfg: DictConfig) -> ExportSettings:

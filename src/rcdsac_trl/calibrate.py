@@ -1,0 +1,28 @@
+"""Hold the critics' quantiles against what happens: ``python -m rcdsac_trl.calibrate run=<folder> beta=[-2,-1]``."""
+
+from omegaconf import DictConfig
+
+from rcdsac_trl.pipeline.cli import entry_point
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse what cannot work, before anything is written."""
+    from rcdsac_trl.pipeline import build
+
+    build.calibration(cfg)
+
+
+@entry_point("calibrate", check=check)
+def main(cfg: DictConfig) -> None:
+    """Roll out, write states and returns, then what they say and a picture of it."""
+    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.report.calibration import write_calibration
+
+    calibration = build.calibration(cfg)
+    calibration.run()
+    print(write_calibration(calibration.out))
+    print(f"written to {calibration.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,204 @@
+r"""What predicted quantiles are worth: coverage, PIT, crossings and tails, from what ``calibrate`` wrote.
+
+A state has 100 predicted quantiles and some returns that were really earned from it. If the prediction is true, a
+share :math:`\tau` of the returns lies below :math:`Z_\tau`, whatever :math:`\tau` (*coverage*), and the share of the
+quantiles below a return (*probability integral transform*, PIT) is uniform over [0, 1].
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from rcdsac_trl.report.style import FAINT, INK, MARKERS, limits, shades, style
+
+COVERED = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
+"""Fractions whose coverage is tabulated."""
+TAIL = 0.1
+"""Share of the worst returns that counts as the tail."""
+PIT_BINS = 10
+
+Array = NDArray[np.float64]
+
+
+def coverage(quantiles: Array, returns: Array) -> Array:
+    """Return the share of returns at or below each predicted quantile.
+
+    Args:
+        quantiles: ``[G, Q]``, one row a state.
+        returns: ``[G, M]``.
+
+    Returns:
+        ``[Q]``; equal to the quantiles' fractions if the predictions are true.
+
+    Example:
+        >>> coverage(np.array([[0.0, 5.0]]), np.array([[1.0, 2.0, 3.0, 9.0]]))
+        array([0.  , 0.75])
+    """
+    return (returns[:, :, None] <= quantiles[:, None, :]).mean((0, 1))
+
+
+def pit(quantiles: Array, returns: Array) -> Array:
+    """Return the share of the quantiles below each return, ``[G, M]``; uniform if the predictions are true.
+
+    Example:
+        >>> pit(np.array([[0.0, 1.0, 2.0, 3.0]]), np.array([[-1.0, 1.5, 9.0]]))
+        array([[0. , 0.5, 1. ]])
+    """
+    return (quantiles[:, None, :] < returns[:, :, None]).mean(-1)
+
+
+def crossing_rate(quantiles: Array) -> float:
+    """Return the share of neighbouring quantiles of which the higher fraction's is smaller.
+
+    Example:
+        >>> crossing_rate(np.array([[0.0, 1.0, 0.5, 2.0]]))
+        0.3333333333333333
+    """
+    return float((np.diff(quantiles, axis=1) < 0.0).mean())
+
+
+def crossing_depth(quantiles: Array) -> float:
+    """Return how far quantiles lie below the largest one of a lower fraction, at worst: a mean over the states.
+
+    Example:
+        >>> crossing_depth(np.array([[0.0, 1.0, 0.5, 2.0], [0.0, 1.0, 2.0, 3.0]]))
+        0.25
+    """
+    return float((np.maximum.accumulate(quantiles, axis=1) - quantiles).max(1).mean())
+
+
+def lower_mean(values: Array, share: float) -> Array:
+    """Return the mean of the lowest share of each row, of which the last value may count in part.
+
+    Args:
+        values: ``[G, M]``.
+        share: above 0, at most 1.
+
+    Example:
+        >>> lower_mean(np.array([[4.0, 1.0, 2.0, 3.0]]), 0.375)  # 1, and half of 2
+        array([1.33333333])
+    """
+    ordered = np.sort(values, axis=1)
+    counted = np.clip(share * values.shape[1] - np.arange(values.shape[1]), 0.0, 1.0)
+    return ordered @ counted / counted.sum()
+
+
+def errors(quantiles: Array, returns: Array) -> Array:
+    """Return what returns exceed the predicted mean of their state by, ``[G, M]``."""
+    return returns - quantiles.mean(1, keepdims=True)
+
+
+def calibration_table(predictions: pd.DataFrame, returns: pd.DataFrame, gamma: float, horizon: int) -> pd.DataFrame:
+    """Sum up a calibration, one row a beta.
+
+    Args:
+        predictions: ``predictions.csv``.
+        returns: ``returns.csv``.
+        gamma: discount.
+        horizon: steps of a roll-out.
+
+    Returns:
+        `states`; `soft_return` and `predicted`, means, and `bias`, their difference; `missing`, what the horizon cuts
+        off if later steps earn what the earlier ones do; `predicted_whole_history`; `correlation` over states of
+        predicted and realised mean; `scatter`, standard deviation of the returns around the predicted mean of their
+        state, and `predicted_scatter`; `rollout_scatter`, that around the realised mean of their state; `tail_depth`,
+        how far the worst tenth of the returns lies below what their states let expect, and `predicted_tail_depth`;
+        `coverage_<fraction>` and `recentred_coverage_<fraction>`; `crossing_rate` and `crossing_depth`.
+    """
+    rows = []
+    for beta, states in predictions.groupby("beta", dropna=False):
+        quantiles, realised = _arrays(states, returns)
+        mean, error = realised.mean(), errors(quantiles, realised)
+        centred = (error - error.mean()).reshape(1, -1)
+        row = {
+            "beta": beta,
+            "states": len(states),
+            "soft_return": mean,
+            "predicted": quantiles.mean(),
+            "bias": -error.mean(),
+            "missing": mean * gamma**horizon / (1.0 - gamma**horizon),
+            "predicted_whole_history": states["whole_history_mean"].mean(),
+            "correlation": _correlation(quantiles.mean(1), realised.mean(1)),
+            "scatter": error.std(),
+            "predicted_scatter": quantiles.std(1).mean(),
+            "rollout_scatter": np.sqrt(realised.var(1, ddof=1).mean()) if realised.shape[1] > 1 else np.nan,
+            "tail_depth": -lower_mean(centred, TAIL)[0],
+            "predicted_tail_depth": (quantiles.mean(1) - lower_mean(quantiles, TAIL)).mean(),
+        }
+        for fraction in COVERED:
+            below = error <= (_at(quantiles, fraction) - quantiles.mean(1))[:, None]
+            recentred = error - error.mean() <= (_at(quantiles, fraction) - quantiles.mean(1))[:, None]
+            row |= {f"coverage_{fraction:g}": below.mean(), f"recentred_coverage_{fraction:g}": recentred.mean()}
+        rows.append(row | {"crossing_rate": crossing_rate(quantiles), "crossing_depth": crossing_depth(quantiles)})
+    return pd.DataFrame(rows)
+
+
+def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFrame) -> Figure:
+    """Draw coverage, PIT, mean against mean, and the shape of the distribution; a colour a beta."""
+    figure = Figure(figsize=(11.0, 7.6), layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=13, color=INK)
+    covered, transformed, means, shape = figure.subplots(2, 2).flat
+    groups = list(predictions.groupby("beta", dropna=False))
+    extremes: list[float] = []
+    for number, ((beta, states), color) in enumerate(zip(groups, shades(len(groups)), strict=True)):
+        quantiles, realised = _arrays(states, returns)
+        error = errors(quantiles, realised)
+        marker = MARKERS[number % len(MARKERS)]
+        label = "all" if pd.isna(beta) else f"β = {float(str(beta)):g}"
+        fractions = (np.arange(quantiles.shape[1]) + 0.5) / quantiles.shape[1]
+        covered.plot(fractions, coverage(quantiles, realised), color=color, linewidth=1.9, label=label)
+        covered.plot(fractions, coverage(quantiles, realised - error.mean()), color=color, linewidth=1.2, linestyle=":")
+        counts, edges = np.histogram(pit(quantiles, realised), bins=PIT_BINS, range=(0.0, 1.0))
+        transformed.stairs(counts / counts.sum(), edges, color=color, linewidth=1.9)
+        predicted, real = quantiles.mean(1), realised.mean(1)
+        means.scatter(predicted, real, s=22, color=color, marker=marker, alpha=0.75, linewidths=0)
+        extremes += [*predicted, *real]
+        shape.plot(fractions, (quantiles - quantiles.mean(1, keepdims=True)).mean(0), color=color, linewidth=1.9)
+        around = np.quantile(error - error.mean(), fractions)
+        shape.plot(fractions, around, color=color, linewidth=1.2, linestyle="--")
+    style(covered, "coverage (dotted: after shifting the level)", "τ", "share of returns below Z_τ")
+    style(transformed, "PIT: where returns lie among the quantiles", "share of quantiles below the return", "returns")
+    style(means, "mean return of a state", "predicted", "earned by roll-outs")
+    style(shape, "around the predicted mean: Z_τ (dashed: returns)", "τ", "return")
+    covered.set(xlim=(0, 1), ylim=(0, 1))
+    covered.plot([0, 1], [0, 1], color=FAINT, linewidth=1.2, linestyle="--", label="true quantiles")
+    transformed.axhline(1 / PIT_BINS, color=FAINT, linewidth=1.2, linestyle="--")
+    transformed.set(xlim=(0, 1), ylim=(0, None))
+    means.plot(limits(extremes), limits(extremes), color=FAINT, linewidth=1.2, linestyle="--")
+    shape.set_xlim(0, 1)
+    covered.legend(frameon=False, fontsize=9, labelcolor=INK)
+    return figure
+
+
+def write_calibration(folder: Path) -> str:
+    """Write ``calibration.csv`` and ``.png`` of a folder that ``calibrate`` wrote; return the table as text."""
+    described = json.loads((folder / "calibration.json").read_text())
+    predictions, returns = (pd.read_csv(folder / f"{name}.csv") for name in ("predictions", "returns"))
+    table = calibration_table(predictions, returns, described["gamma"], described["horizon_steps"])
+    table.to_csv(folder / "calibration.csv", index=False, float_format="%.6g")
+    title = f"{described['agent']}, sensor {described['sensor']}, {described['checkpoint']}: predicted and real returns"
+    calibration_figure(title, predictions, returns).savefig(folder / "calibration.png", dpi=130)
+    return str(table.set_index("beta").T.to_string(float_format="%.3f"))
+
+
+def _arrays(states: pd.DataFrame, returns: pd.DataFrame) -> tuple[Array, Array]:
+    """Return the quantiles ``[G, Q]`` and the soft returns ``[G, M]`` of some states, in one order."""
+    wanted = states[["beta", "map", "state"]]
+    quantiles = states.filter(regex=r"^q\d+$").to_numpy()
+    earned = wanted.merge(returns, on=["beta", "map", "state"], how="left", validate="one_to_many")
+    return quantiles, earned["soft_return"].to_numpy().reshape(len(states), -1)
+
+
+def _at(quantiles: Array, fraction: float) -> Array:
+    """Return the quantile ``[G]`` of a fraction, between the neighbours that were read."""
+    fractions = (np.arange(quantiles.shape[1]) + 0.5) / quantiles.shape[1]
+    return np.array([np.interp(fraction, fractions, row) for row in quantiles])
+
+
+def _correlation(a: Array, b: Array) -> float:
+    varies = len(a) > 1 and a.std() > 0 and b.std() > 0
+    return float(np.corrcoef(a, b)[0, 1]) if varies else float("nan")
