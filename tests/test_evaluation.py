@@ -31,6 +31,7 @@ from rcdsac_trl.pipeline.policies import LeanPolicy, PursuitPolicy
 from rcdsac_trl.pipeline.saved import Progress, load_progress
 from rcdsac_trl.pipeline.settings import AlgoSettings, WorldSettings
 from rcdsac_trl.pipeline.teams import Driven, Team
+from rcdsac_trl.pipeline.trips import TRIP_METRICS
 from rcdsac_trl.pipeline.validation import Snapshot
 from rcdsac_trl.world.env import make_env
 from tiny import evaluate, tiny_settings, tiny_trainer
@@ -114,6 +115,7 @@ def test_the_description_says_what_was_measured(run: Path, tmp_path: Path) -> No
     described = json.loads((out / "evaluation.json").read_text())
     expected = {
         "agent": "rcdsac_pow",
+        "train_seed": 0,
         "measure": "pow",
         "sensor": "narrow",
         "checkpoint": "best",
@@ -145,7 +147,7 @@ def test_nothing_is_written_when_it_is_stopped(
 def test_rows_and_summary_add_up(run: Path, tmp_path: Path) -> None:
     out = evaluate(f"run={run}", "beta=[-1,-2]", "num_maps=2", "num_episodes=3", f"out={tmp_path / 'out'}")
     episodes, summary = pd.read_csv(out / "episodes.csv"), pd.read_csv(out / "summary.csv")
-    assert list(episodes) == ["beta", "collision_weight", "map", "episode", *METRICS]
+    assert list(episodes) == ["beta", "collision_weight", "map", "episode", *METRICS, *TRIP_METRICS]
     keys = list(episodes[["beta", "map", "episode"]].itertuples(index=False, name=None))
     assert keys == [(beta, map_, i) for beta in (-2.0, -1.0) for map_ in (0, 1) for i in range(3)]
     assert summary["beta"].tolist() == [-2.0, -1.0]
@@ -176,7 +178,7 @@ class Hits:
 
     def drive(self, policy: TensorDictModuleBase, episode: int, **asked: Any) -> Driven:
         assert (asked["observed"], asked["happened"]) == (
-            ("velocity",),
+            ("velocity", "pose"),
             ("contact", "goal_reached", "reward_components"),
         )
         policy(TensorDict({"done": torch.zeros(self.num_agents, 1)}, [self.num_agents]))

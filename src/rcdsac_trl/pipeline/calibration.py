@@ -63,6 +63,7 @@ def roll_out(
     alpha: float,
     generator: torch.Generator,
     episode: int,
+    before_step: Callable[[], None] = interruption_point,
 ) -> Branches:
     r"""Drive groups of agents that part from each other at a step of their own.
 
@@ -79,6 +80,7 @@ def roll_out(
         alpha: temperature.
         generator: source of the actions' noise.
         episode: number of the episode and its map.
+        before_step: called before each step.
     """
     encoder, head = actor[0], actor[1]
     parting = torch.tensor(branch_steps).repeat_interleave(num_rollouts)
@@ -88,7 +90,7 @@ def roll_out(
     soft, plain = torch.zeros(len(parting), dtype=torch.float64), torch.zeros(len(parting), dtype=torch.float64)
     tensordict = env.reset(episode=episode)
     for step in range(max(branch_steps) + horizon_steps):
-        interruption_point()
+        before_step()
         state = encoder.module.step(*[tensordict[key] for key in (*encoder.in_keys, "is_init", STATE_KEY)])
         loc, scale = head.module(state, *[tensordict[key] for key in head.in_keys[1:]])
         noise = torch.empty_like(loc).normal_(generator=generator)
@@ -162,6 +164,7 @@ def measure_map(
     gamma: float,
     generator: torch.Generator,
     map_index: int,
+    before_step: Callable[[], None] = interruption_point,
 ) -> Rows:
     """Predict and roll out some states of one map, under each beta.
 
@@ -177,6 +180,7 @@ def measure_map(
         gamma: discount.
         generator: source of the actions' noise.
         map_index: the map's number.
+        before_step: called before each step.
 
     Returns:
         One row a state: `beta`, `map`, `state`, `step`; `quantiles`, a list of 100, of the critics taken together as
@@ -196,6 +200,7 @@ def measure_map(
             alpha=loss.alpha.item(),
             generator=generator,
             episode=map_index,
+            before_step=before_step,
         )
         critics = predict(loss, branches.history, branch_steps=steps, risk=risk, memory_steps=memory_steps)
         whole = predict(loss, branches.history, branch_steps=steps, risk=risk, memory_steps=max(steps) + 1)

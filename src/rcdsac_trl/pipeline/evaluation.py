@@ -9,19 +9,21 @@ from typing import Any
 
 import pandas as pd
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.interrupts import interruption_point
-from rcdsac_trl.pipeline.metrics import METRICS, Condition, episode_metrics, summarise
+from rcdsac_trl.pipeline.metrics import Condition, episode_metrics, summarise
 from rcdsac_trl.pipeline.resources import check_writable
 from rcdsac_trl.pipeline.teams import Team
 
 # What an episode's row needs; everything else of a step is dropped at once.
-_OBSERVED = ("velocity",)
+_OBSERVED = ("velocity", "pose")
 _HAPPENED = ("contact", "goal_reached", "reward_components")
 
 
@@ -34,6 +36,7 @@ def measure_map(
     map_index: int,
     sampled: bool = False,
     before_step: Callable[[], None] = interruption_point,
+    more: Callable[[TensorDictBase], dict[str, Tensor]] | None = None,
 ) -> Rows:
     """Measure a policy on one map.
 
@@ -46,14 +49,17 @@ def measure_map(
         map_index: number of the map and its episode.
         sampled: draw actions instead of taking tanh(mean).
         before_step: called before each step.
+        more: measures more of the episodes, ``[N]`` a column.
 
     Returns:
-        One row an episode: `beta`, `collision_weight`, `map`, `episode` and :data:`METRICS`.
+        One row an episode: `beta`, `collision_weight`, `map`, `episode`, the metrics of :func:`episode_metrics` and
+        what `more` measures.
     """
     kind = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
         driven = team.drive(policy, map_index, observed=_OBSERVED, happened=_HAPPENED, before_step=before_step)
-    measured = episode_metrics(driven.tensordict())
+    episodes = driven.tensordict()
+    measured = episode_metrics(episodes) | ({} if more is None else more(episodes))
     rows = []
     for i in range(len(conditions) * num_agents):
         condition = conditions[i // num_agents]
@@ -63,7 +69,7 @@ def measure_map(
             "map": map_index,
             "episode": i % num_agents,
         }
-        rows.append(row | {metric: measured[metric][i].item() for metric in METRICS})
+        rows.append(row | {metric: values[i].item() for metric, values in measured.items()})
     return rows
 
 

@@ -81,12 +81,14 @@ def summarise(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     """Give mean and standard deviation (over episodes, ddof 0) of every metric, and the number of episodes.
 
     Args:
-        episodes: one row an episode, as :func:`rcdsac_trl.pipeline.evaluation.evaluate` returns them.
+        episodes: one row an episode, as :func:`rcdsac_trl.pipeline.evaluation.table_of` returns them.
         by: columns that make a group; missing values form groups of their own.
+
+    Metrics are all columns but those and `map` and `episode`; an episode that has none of one does not count in it.
     """
     groups = episodes.groupby(by, dropna=False, sort=False)
     parts: dict[str, pd.Series] = {"episodes": groups.size()}
-    for metric in METRICS:
+    for metric in episodes.columns.drop([*by, "map", "episode"], errors="ignore"):
         parts[f"{metric}_mean"] = groups[metric].mean()
         parts[f"{metric}_std"] = groups[metric].std(ddof=0)
     return pd.DataFrame(parts).reset_index()

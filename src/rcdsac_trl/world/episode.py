@@ -47,6 +47,12 @@ def load_map(settings: MapSettings, split: Split, seed: int, index: int) -> tupl
     return map_, Planner(map_)
 
 
+def draw_motor_steps(task: TaskSettings, split: Split, seed: int, episode: int, agent_id: int) -> int:
+    """Return how many motor steps an agent step of this episode takes: its control period."""
+    rng = stream(seed, f"motor_steps/{split}", episode, agent_id)
+    return int(rng.choice(task.motor_steps))
+
+
 class NavigationAgent:
     """One robot in its own simulation.
 
@@ -101,7 +107,7 @@ class NavigationAgent:
         rng = self._stream("start")
         x, y = self._planner.sample_free(rng).tolist()
         self.pose = (x, y, rng.uniform(-math.pi, math.pi))
-        self._motor_steps = int(self._stream("motor_steps").choice(self._task.motor_steps))
+        self._motor_steps = draw_motor_steps(self._task, self._split, seed, episode, self._agent_id)
         if self._simulation is None:
             self._simulation = Simulation(gui=self._gui)
         self._simulation.load(self._map, self._planner, self.pose, self._stream("movers"))

@@ -2,7 +2,7 @@
 
 import contextlib
 import sys
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -115,7 +115,7 @@ def _driver(
     )
     latest = trained.task.episode_steps - settings.horizon_steps
 
-    def drive(map_index: int) -> Rows:
+    def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         steps = stream(settings.seed, "calibration steps", map_index).integers(latest, size=settings.num_states)
         return measure_map(
             env,
@@ -129,6 +129,7 @@ def _driver(
             gamma=trained.learner.gamma,
             generator=torch_stream(settings.seed, "calibration actions", map_index),
             map_index=map_index,
+            before_step=before_step,
         )
 
     try:

@@ -3,11 +3,15 @@
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import safetensors.torch
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
+from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.pipeline import runtime
 from rcdsac_trl.pipeline.build.agent import make_actor, make_policy
 from rcdsac_trl.pipeline.build.world import evaluation_team
@@ -17,6 +21,8 @@ from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import WorldSettings
+from rcdsac_trl.pipeline.trips import trip_metrics
+from rcdsac_trl.world.episode import draw_motor_steps, load_map
 from rcdsac_trl.world.maps import Split
 
 
@@ -34,6 +40,7 @@ class Course:
         sampled: draw actions instead of taking tanh(mean).
         device: where the policy acts.
         threads: that torch uses for one operation while it drives.
+        trips: measure the ways driven, too.
     """
 
     trained: TrainingSettings
@@ -45,6 +52,7 @@ class Course:
     sampled: bool
     device: str
     threads: int
+    trips: bool = False
 
 
 @contextlib.contextmanager
@@ -76,6 +84,7 @@ def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
             map_index=map_index,
             sampled=course.sampled,
             before_step=before_step,
+            more=partial(_trips, course, map_index) if course.trips else None,
         )
 
     try:
@@ -83,6 +92,16 @@ def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
     finally:
         team.close()
         torch.set_num_threads(threads)
+
+
+def _trips(course: Course, map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:
+    """Measure the ways of the episodes on a map."""
+    task = course.world.task
+    _, planner = load_map(course.world.map_settings, course.split, course.seed, map_index)
+    agents = range(course.num_episodes)
+    steps = [draw_motor_steps(task, course.split, course.seed, map_index, agent) for agent in agents]
+    period_s = MOTOR_PERIOD_S * torch.tensor(steps * len(course.conditions), dtype=torch.float64)
+    return trip_metrics(episodes, planner, period_s)
 
 
 def _policy(course: Course, actor: bytes, noise: AgentNoise) -> TensorDictModuleBase:

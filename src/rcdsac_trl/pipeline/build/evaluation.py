@@ -63,6 +63,7 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
             sampled=settings.sampled,
             device=device,
             threads=1 if settings.threads == "auto" else settings.threads,
+            trips=True,
         )
         make = partial(driver, course, weights)
         processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
@@ -72,6 +73,7 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         "agent": settings.baseline if algo is None else algo.name,
         "measure": None if algo is None else algo.distortion.name,
         "sensor": world.sensor,
+        "train_seed": None if algo is None else trained.seed,
         "checkpoint": None if algo is None else settings.checkpoint,
         "split": settings.split,
         "seed": settings.seed,
