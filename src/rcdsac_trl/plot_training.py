@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -26,6 +25,7 @@ from rcdsac_trl.pipeline.cli import entry_point
 from rcdsac_trl.pipeline.logs import CONFIG_NAME, TRAINING_TABLE
 from rcdsac_trl.pipeline.metrics import validation_score
 from rcdsac_trl.pipeline.resources import check_picture
+from rcdsac_trl.report.style import FAINT, INK, MARKERS, shades, style
 
 PANELS: Mapping[str, str] = {
     "reward": "reward per episode",
@@ -38,12 +38,6 @@ PANELS: Mapping[str, str] = {
 
 _CONDITIONS = ("beta", "collision_weight")
 _SYMBOLS = {"beta": "β", "collision_weight": "w_coll"}
-# Dark is the lowest value; the map's pale end is left out. Shapes tell the lines apart where colours do not.
-_COLORS = matplotlib.colormaps["viridis"]
-_PALEST = 0.85
-_MARKERS = "osD^vP"
-_INK = "#3d4450"
-_FAINT = "#9aa3b2"
 _DOTS = (0, (1, 2))
 # Metrics that have no bound, and the share of the training iterations at either end that may leave their panels.
 _UNBOUNDED = ("reward", "collisions")
@@ -69,14 +63,13 @@ def validation_curves(episodes: pd.DataFrame) -> list[Curve]:
     # Groups come in ascending order.
     groups = list(episodes.groupby(list(_CONDITIONS), dropna=False))
     curves = []
-    for number, (values, rows) in enumerate(groups):
+    for number, ((values, rows), color) in enumerate(zip(groups, shades(len(groups)), strict=True)):
         # A missing value is not equal to itself: a condition has one of the two, or neither.
         named = [
             f", {_SYMBOLS[key]} = {value:g}" for key, value in zip(_CONDITIONS, values, strict=True) if value == value
         ]
         label = "validation" + "".join(named)
-        color = _COLORS(_PALEST * number / max(len(groups) - 1, 1))
-        curves.append(Curve(label, color, _MARKERS[number % len(_MARKERS)], _means(rows)))
+        curves.append(Curve(label, color, MARKERS[number % len(MARKERS)], _means(rows)))
     return curves
 
 
@@ -105,18 +98,18 @@ def learning_curve(title: str, training: pd.DataFrame, validation: pd.DataFrame 
     """
     curves = [] if validation is None else validation_curves(validation)
     best = None if validation is None else best_updates(validation, episode_steps)
-    faint = Curve("training episodes", _FAINT, "", _means(training))
+    faint = Curve("training episodes", FAINT, "", _means(training))
     figure = Figure(figsize=(11.0, 6.2), layout="constrained")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=13, color=_INK)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=13, color=INK)
     for number, (metric, heading) in enumerate(PANELS.items(), start=1):
         axes = figure.add_subplot(2, 3, number)
-        axes.set_title(heading, loc="left", fontsize=10, color=_INK)
         _draw_curve(axes, faint, metric, linewidth=1.2, alpha=0.8)
         for curve in curves:
             _draw_curve(axes, curve, metric, linewidth=1.9)
         if best is not None:
-            axes.axvline(best, color=_INK, linewidth=0.9, linestyle=_DOTS, zorder=0)
-        _style(axes)
+            axes.axvline(best, color=INK, linewidth=0.9, linestyle=_DOTS, zorder=0)
+        style(axes, heading, "updates")
+        _style_updates(axes)
         _set_limits(axes, metric, faint, curves)
     _draw_legend(figure, [faint, *curves], best)
     return figure
@@ -186,16 +179,10 @@ def _draw_curve(axes: Axes, curve: Curve, metric: str, linewidth: float, alpha: 
     )
 
 
-def _style(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(_FAINT)
-    axes.tick_params(color=_FAINT, labelcolor=_INK, labelsize=9)
-    axes.grid(color="#e9ebef", linewidth=0.8)
-    axes.set_axisbelow(True)
+def _style_updates(axes: Axes) -> None:
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    axes.set_xlabel("updates", fontsize=9, color=_INK)
 
 
 def _set_limits(axes: Axes, metric: str, training: Curve, validation: list[Curve]) -> None:
@@ -219,8 +206,8 @@ def _draw_legend(figure: Figure, curves: list[Curve], best: int | None) -> None:
     ]
     if best is not None:
         label = f"best checkpoint ({best:,} updates)"
-        handles.append(Line2D([], [], color=_INK, linewidth=0.9, linestyle=_DOTS, label=label))
-    axes.legend(handles=handles, loc="center left", frameon=False, fontsize=10, labelcolor=_INK)
+        handles.append(Line2D([], [], color=INK, linewidth=0.9, linestyle=_DOTS, label=label))
+    axes.legend(handles=handles, loc="center left", frameon=False, fontsize=10, labelcolor=INK)
 
 
 def _run_folder(cfg: DictConfig) -> Path:

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from rcdsac_trl.report.statistics import Array, lower_mean
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, limits, shades, style
 
 COVERED = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
@@ -20,8 +20,6 @@ COVERED = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 TAIL = 0.1
 """Share of the worst returns that counts as the tail."""
 PIT_BINS = 10
-
-Array = NDArray[np.float64]
 
 
 def coverage(quantiles: Array, returns: Array) -> Array:
@@ -69,22 +67,6 @@ def crossing_depth(quantiles: Array) -> float:
         0.25
     """
     return float((np.maximum.accumulate(quantiles, axis=1) - quantiles).max(1).mean())
-
-
-def lower_mean(values: Array, share: float) -> Array:
-    """Return the mean of the lowest share of each row, of which the last value may count in part.
-
-    Args:
-        values: ``[G, M]``.
-        share: above 0, at most 1.
-
-    Example:
-        >>> lower_mean(np.array([[4.0, 1.0, 2.0, 3.0]]), 0.375)  # 1, and half of 2
-        array([1.33333333])
-    """
-    ordered = np.sort(values, axis=1)
-    counted = np.clip(share * values.shape[1] - np.arange(values.shape[1]), 0.0, 1.0)
-    return ordered @ counted / counted.sum()
 
 
 def errors(quantiles: Array, returns: Array) -> Array:

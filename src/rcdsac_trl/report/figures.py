@@ -1,0 +1,139 @@
+"""The figures of a report."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
+from rcdsac_trl.report import statistics
+from rcdsac_trl.report.findings import TAILS, labels
+from rcdsac_trl.report.read import Episodes
+from rcdsac_trl.report.statistics import Statistic
+from rcdsac_trl.report.style import FAINT, INK, MARKERS, shades, style
+
+# What follows beta, in four panels.
+_RESPONSES: dict[str, tuple[str, Statistic]] = {
+    "collisions an episode": ("collisions", statistics.mean),
+    "mean speed, m/s": ("mean_speed_m_per_s", statistics.mean),
+    "goals an episode": ("goals", statistics.mean),
+    f"reward: all (dashed) and the worst {TAILS[0]:.0%}": ("reward", statistics.cvar(TAILS[0])),
+}
+_LEARNT = ("reward", "collisions")
+
+
+def beta_response(episodes: Episodes, measure: str) -> Figure | None:
+    """Draw what beta does: collisions, speed, goals and realised tail return, with 95 % intervals.
+
+    Args:
+        episodes: of all agents.
+        measure: its agents are drawn, such as ``pow``; betas of two measures share no axis.
+
+    Returns:
+        None where no agent was driven at two betas of the measure.
+    """
+    told = episodes.conditions.dropna(subset="beta")
+    told = told[told["measure"] == measure]
+    groups = [(key, rows) for key, rows in told.groupby(["agent", "sensor"], sort=False) if len(rows) > 1]
+    if not groups:
+        return None
+    figure = Figure(figsize=(11.0, 6.4), layout="constrained")
+    figure.suptitle(
+        f"What β does ({measure}): averse at the left; 95 % intervals over maps",
+        x=0.01,
+        ha="left",
+        fontsize=13,
+        color=INK,
+    )
+    panels = figure.subplots(2, 2).flat
+    for axes, (heading, (metric, statistic)) in zip(panels, _RESPONSES.items(), strict=True):
+        for number, ((key, rows), color) in enumerate(zip(groups, shades(len(groups)), strict=True)):
+            ordered = rows.sort_values("beta")
+            values = [episodes.of(condition, metric) for _, condition in ordered.iterrows()]
+            marker = MARKERS[number % len(MARKERS)]
+            name = ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
+            _draw_intervals(
+                axes, ordered["beta"], [statistics.bootstrap(v, statistic) for v in values], color, marker, name
+            )
+            if metric == "reward":
+                axes.plot(
+                    ordered["beta"], [statistics.mean(v) for v in values], color=color, linestyle="--", linewidth=1.2
+                )
+        style(axes, heading, "β")
+        axes.set_xticks(sorted(told["beta"].unique()))
+        if metric != "reward":
+            axes.set_ylim(bottom=0)
+        if len(groups) > 1 and metric == "collisions":
+            axes.legend(frameon=False, fontsize=9, labelcolor=INK)
+    return figure
+
+
+def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figure:
+    """Draw each condition's mean difference from one of them on the same maps: a dot a map, mean and 95 % interval.
+
+    Args:
+        episodes: of all agents.
+        reference: number of the condition that the others are compared with.
+        metric: which one.
+    """
+    conditions, names = episodes.conditions, labels(episodes)
+    base = conditions.iloc[reference]
+    others = [i for i in range(len(conditions)) if i != reference and conditions.iloc[i]["sensor"] == base["sensor"]]
+    figure = Figure(figsize=(11.0, 1.6 + 0.42 * len(others)), layout="constrained")
+    axes = figure.subplots()
+    rng = np.random.default_rng(0)
+    for row, i in enumerate(others):
+        first, second = episodes.of(conditions.iloc[i], metric), episodes.of(base, metric)
+        maps = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
+        found = statistics.compare(first, second).difference
+        axes.scatter(maps, row + rng.uniform(-0.16, 0.16, len(maps)), s=9, color=FAINT, alpha=0.6, linewidths=0)
+        axes.plot([found.low, found.high], [row, row], color=INK, linewidth=2.2, solid_capstyle="butt")
+        axes.plot(found.value, row, "o", color=INK, markersize=6)
+    style(axes, f"{metric}: difference from {names[reference]}, map by map (mean and 95 % interval)")
+    axes.axvline(0, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
+    axes.set_yticks(range(len(others)), [names[i] for i in others])
+    axes.invert_yaxis()
+    return figure
+
+
+def learning_curves(runs: Mapping[str, pd.DataFrame]) -> Figure:
+    """Draw validation reward and collisions over updates and over wall time, a line a run (mean over its betas).
+
+    Args:
+        runs: validation episodes with `updates` and `elapsed_s`, by the run's name.
+    """
+    figure = Figure(figsize=(11.0, 6.4), layout="constrained")
+    figure.suptitle("Validation during training", x=0.01, ha="left", fontsize=13, color=INK)
+    panels = figure.subplots(2, 2)
+    for column, (clock, label, scale) in enumerate((("updates", "updates", 1.0), ("elapsed_s", "minutes", 1 / 60))):
+        for row, metric in enumerate(_LEARNT):
+            axes = panels[row][column]
+            for number, ((name, rows), color) in enumerate(zip(runs.items(), shades(len(runs)), strict=True)):
+                means = rows.groupby(clock)[metric].mean()
+                marker = MARKERS[number % len(MARKERS)]
+                axes.plot(
+                    means.index * scale, means, color=color, marker=marker, markersize=4, linewidth=1.9, label=name
+                )
+            style(axes, f"{metric} an episode", label)
+            axes.set_xlim(left=0)
+            axes.xaxis.set_major_locator(MaxNLocator(5))
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+            if metric == "collisions":
+                axes.set_ylim(bottom=0)
+    panels[0][0].legend(frameon=False, fontsize=9, labelcolor=INK)
+    return figure
+
+
+def _draw_intervals(
+    axes: Axes,
+    x: pd.Series,
+    intervals: list[statistics.Interval],
+    color: tuple[float, float, float, float],
+    marker: str,
+    label: str,
+) -> None:
+    middle = [interval.value for interval in intervals]
+    axes.fill_between(x, [i.low for i in intervals], [i.high for i in intervals], color=color, alpha=0.15, linewidth=0)
+    axes.plot(x, middle, color=color, marker=marker, markersize=6, linewidth=1.9, label=label)

@@ -1,0 +1,106 @@
+"""Statistics of all conditions as tables: summaries, comparisons in pairs, and trends in beta."""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+
+from rcdsac_trl.report import statistics
+from rcdsac_trl.report.read import CONDITION, Episodes
+from rcdsac_trl.report.statistics import Interval, Statistic
+from rcdsac_trl.report.table import condition_label
+
+TAILS = (0.1, 0.25)
+"""Shares of the worst returns whose mean is given: realised CVaR."""
+SUMMARISED: dict[str, tuple[str, Statistic]] = {
+    "reward, interquartile mean": ("reward", statistics.interquartile_mean),
+    **{f"reward, mean of the worst {share:.0%}": ("reward", statistics.cvar(share)) for share in TAILS},
+}
+"""Statistics beside the means of all metrics: of which metric, and which."""
+TRENDS = ("collisions", "mean_speed_m_per_s", "goals", "reward")
+_COMPARED = ("collisions", "reward")
+# Collisions are better fewer.
+_BETTER_DOWN = {"collisions"}
+
+
+def labels(episodes: Episodes) -> list[str]:
+    """Name the conditions, in their order."""
+    sensors = episodes.conditions["sensor"].nunique()
+    agents, names, betas, weights = (episodes.conditions[key].tolist() for key in CONDITION)
+    rows = zip(agents, names, betas, weights, strict=True)
+    return [condition_label(agent, sensor, beta, weight, sensors) for agent, sensor, beta, weight in rows]
+
+
+def summary(episodes: Episodes) -> pd.DataFrame:
+    """Return `condition`, `statistic`, `value`, `low`, `high`: every metric's mean, and :data:`SUMMARISED`."""
+    rows = []
+    for (_, condition), label in zip(episodes.conditions.iterrows(), labels(episodes), strict=True):
+        wanted = {metric: (metric, statistics.mean) for metric in episodes.metrics} | SUMMARISED
+        for name, (metric, statistic) in wanted.items():
+            interval = statistics.bootstrap(episodes.of(condition, metric), statistic)
+            rows.append({"condition": label, "statistic": name} | vars(interval))
+    return pd.DataFrame(rows)
+
+
+def comparisons(episodes: Episodes) -> pd.DataFrame:
+    """Compare all conditions of one sensor with each other, on the same maps.
+
+    Returns:
+        One row a pair and metric: `sensor`, `first`, `second`, `metric`, `difference`, `low`, `high`; `better`, the
+        probability that an episode of the first is the better one, `better_low`, `better_high`; and `p_value`,
+        adjusted by Holm's method for the number of pairs of its sensor, a metric at a time.
+    """
+    rows = []
+    named = list(zip(episodes.conditions.iterrows(), labels(episodes), strict=True))
+    for ((_, first), first_label), ((_, second), second_label) in itertools.combinations(named, 2):
+        if first["sensor"] != second["sensor"]:
+            continue
+        for metric in _COMPARED:
+            found = statistics.compare(episodes.of(first, metric), episodes.of(second, metric))
+            better = found.improvement
+            if metric in _BETTER_DOWN:
+                better = Interval(1 - better.value, 1 - better.high, 1 - better.low)
+            rows.append(
+                {
+                    "sensor": first["sensor"],
+                    "first": first_label,
+                    "second": second_label,
+                    "metric": metric,
+                    "difference": found.difference.value,
+                    "low": found.difference.low,
+                    "high": found.difference.high,
+                    "better": better.value,
+                    "better_low": better.low,
+                    "better_high": better.high,
+                    "p_value": found.p_value,
+                }
+            )
+    table = pd.DataFrame(rows)
+    if rows:
+        families = table.groupby(["sensor", "metric"])["p_value"]
+        table["p_value"] = families.transform(lambda values: statistics.holm(values.tolist()))
+    return table
+
+
+def trends(episodes: Episodes) -> pd.DataFrame:
+    """Test whether metrics go with beta, for each agent that was driven at three values of it or more.
+
+    Returns:
+        `agent`, `sensor`, `metric`, `settings`, `correlation` and `p_value`, see
+        :func:`rcdsac_trl.report.statistics.trend`; `worst_reward` is the worst episode of each map and beta.
+    """
+    rows = []
+    told = episodes.conditions.dropna(subset="beta")
+    for (agent, sensor), conditions in told.groupby(["agent", "sensor"], sort=False):
+        if len(conditions) < 3:
+            continue
+        ordered = [condition for _, condition in conditions.sort_values("beta").iterrows()]
+        columns = {
+            metric: [np.nanmean(episodes.of(condition, metric), axis=(0, 2)) for condition in ordered]
+            for metric in TRENDS
+        }
+        columns["worst_reward"] = [episodes.of(condition, "reward").min((0, 2)) for condition in ordered]
+        for metric, values in columns.items():
+            found = statistics.trend(np.stack(values, 1))
+            rows.append({"agent": agent, "sensor": sensor, "metric": metric, "settings": len(ordered)} | vars(found))
+    return pd.DataFrame(rows)

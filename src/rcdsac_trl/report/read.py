@@ -1,0 +1,194 @@
+"""What evaluations and trainings left behind, checked to be comparable."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.report.statistics import Array
+
+DESCRIPTION = "evaluation.json"
+CONDITION = ("agent", "sensor", "beta", "collision_weight")
+"""Columns that say what drove an episode."""
+_EPISODE = ("train_seed", "map", "episode")
+# What must be equal for agents to have met the same maps, starts, goals and movers, under the same rules.
+_PROTOCOL = ("split", "seed", "num_maps", "num_episodes", "sampled", "map", "task")
+
+METRIC_NAMES: dict[str, str] = {
+    "collisions": "collisions an episode",
+    "reward": "reward an episode",
+    "goals": "goals an episode",
+    "mean_speed_m_per_s": "mean speed, m/s",
+    "contact_fraction": "share of steps in contact",
+    "collision_free": "share of episodes without collision",
+    "success": "success at the first goal",
+    "collided": "collision before the first goal",
+    "timed_out": "timeout before the first goal",
+    "time_to_goal_s": "time to the first goal, s",
+    "spl": "SPL to the first goal",
+    "distance_m": "distance driven, m",
+    "contact_s": "time in contact, s",
+    "smallest_clearance_m": "smallest clearance, m",
+}
+"""Metrics in the order of reports, and what they are called there."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One folder that ``evaluate`` wrote.
+
+    Attributes:
+        folder: where it lies.
+        described: ``evaluation.json``.
+        episodes: ``episodes.csv``.
+    """
+
+    folder: Path
+    described: dict[str, Any]
+    episodes: pd.DataFrame
+
+    @property
+    def protocol(self) -> dict[str, Any]:
+        """What decides which maps, starts, goals and movers were met, and under which rules."""
+        return {key: self.described[key] for key in _PROTOCOL}
+
+
+def find_evaluations(folders: Sequence[Path]) -> list[Path]:
+    """Return the evaluations among and in some folders.
+
+    Args:
+        folders: of evaluations, or of runs, whose ``evaluation/`` holds some.
+
+    Raises:
+        UserInputError: for a folder without any.
+    """
+    found: list[Path] = []
+    for folder in folders:
+        inside = [folder] if (folder / DESCRIPTION).is_file() else []
+        inside += sorted(path.parent for path in folder.glob(f"evaluation/*/{DESCRIPTION}"))
+        if not inside:
+            raise UserInputError(f"{folder} holds no {DESCRIPTION}: evaluate it first, or name another folder")
+        found += [path for path in inside if path not in found]
+    return found
+
+
+def read_evaluation(folder: Path) -> Evaluation:
+    """Read an evaluation.
+
+    Raises:
+        UserInputError: if it is incomplete, or of a version that described less.
+    """
+    try:
+        described = json.loads((folder / DESCRIPTION).read_text())
+        episodes = pd.read_csv(folder / "episodes.csv")
+        missing = {*_PROTOCOL, "agent", "sensor"} - set(described)
+        missing |= {"beta", "collision_weight", "map", "episode", "collisions", "reward"} - set(episodes)
+    except (OSError, ValueError, TypeError) as error:
+        raise UserInputError(f"{folder} cannot be read ({error}): evaluate again into another folder") from error
+    if missing:
+        raise UserInputError(f"{folder} does not say {', '.join(sorted(missing))}: evaluate again with this version")
+    return Evaluation(folder, described, episodes)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The episodes of several evaluations on the same maps.
+
+    Attributes:
+        table: one row an episode: :data:`CONDITION`, `train_seed`, `map`, `episode` and the metrics that all have.
+        protocol: of all evaluations.
+    """
+
+    table: pd.DataFrame
+    protocol: dict[str, Any]
+
+    @cached_property
+    def metrics(self) -> list[str]:
+        """The metrics there are, in the order of reports."""
+        return [metric for metric in METRIC_NAMES if metric in self.table]
+
+    @cached_property
+    def conditions(self) -> pd.DataFrame:
+        """One row a condition, with the agent's measure, in the order of the evaluations, then by beta."""
+        rows = self.table[[*CONDITION, "measure"]].drop_duplicates()
+        agents = list(rows["agent"].unique())
+        rows = rows.assign(order=rows["agent"].map(agents.index))
+        return rows.sort_values(["sensor", "order", "beta", "collision_weight"], ignore_index=True).drop(
+            columns="order"
+        )
+
+    def of(self, condition: pd.Series, metric: str) -> Array:
+        """Return a metric under a condition: ``[training seeds, maps, episodes]``."""
+        rows = self.table
+        for key in CONDITION:
+            value = condition[key]
+            rows = rows[rows[key].isna() if pd.isna(value) else rows[key] == value]
+        ordered = rows.sort_values(list(_EPISODE))
+        shape = (-1, self.protocol["num_maps"], self.protocol["num_episodes"])
+        return ordered[metric].to_numpy(np.float64).reshape(shape)
+
+
+def read_episodes(folders: Sequence[Path]) -> Episodes:
+    """Read evaluations that can be compared.
+
+    Args:
+        folders: as for :func:`find_evaluations`.
+
+    Raises:
+        UserInputError: if there are none, if maps, starts, goals or rules differ, or if two hold the same.
+    """
+    if not folders:
+        raise UserInputError("name what to report on: runs=[<folder>,...] of runs or of their evaluations")
+    evaluations = [read_evaluation(folder) for folder in find_evaluations(folders)]
+    _check_same_maps(evaluations)
+    tables = [
+        evaluation.episodes.assign(
+            agent=evaluation.described["agent"],
+            sensor=evaluation.described["sensor"],
+            measure=evaluation.described.get("measure"),
+            train_seed=evaluation.described.get("train_seed") or 0,
+            folder=str(evaluation.folder),
+        )
+        for evaluation in evaluations
+    ]
+    shared = set.intersection(*(set(table) for table in tables))
+    table = pd.concat([part[[column for column in part if column in shared]] for part in tables], ignore_index=True)
+    _check_complete(table, evaluations[0].protocol)
+    table = table.drop(columns="folder").assign(collision_free=(table["collisions"] == 0).astype(float))
+    return Episodes(table, evaluations[0].protocol)
+
+
+def _check_same_maps(evaluations: Sequence[Evaluation]) -> None:
+    first = evaluations[0]
+    for other in evaluations[1:]:
+        for key in _PROTOCOL:
+            here, there = first.described[key], other.described[key]
+            if here != there:
+                what = key
+                if isinstance(here, dict) and isinstance(there, dict):
+                    part = next(name for name in [*here, *there] if here.get(name) != there.get(name))
+                    what, here, there = f"{key}.{part}", here.get(part), there.get(part)
+                raise UserInputError(
+                    f"{first.folder} and {other.folder} did not meet the same maps, starts and goals ({what} is {here} "
+                    f"and {there}): evaluate them alike, or report on them apart"
+                )
+
+
+def _check_complete(table: pd.DataFrame, protocol: dict[str, Any]) -> None:
+    expected = protocol["num_maps"] * protocol["num_episodes"]
+    for _, rows in table.groupby([*CONDITION, "train_seed"], dropna=False):
+        names = sorted(set(rows["folder"]))
+        if len(names) > 1:
+            raise UserInputError(
+                f"{names[0]} and {names[1]} hold the same agent, training seed and beta: leave one out"
+            )
+        if len(rows) != expected or rows.duplicated(["map", "episode"]).any():
+            raise UserInputError(
+                f"{names[0]} holds {len(rows)} episodes of a beta instead of {expected}: evaluate again"
+            )

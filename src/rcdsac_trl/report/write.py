@@ -1,0 +1,134 @@
+"""A report's folder: the table in four formats, the statistics, the figures, and one page that holds them all."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from rcdsac_trl.report import findings, learning, table
+from rcdsac_trl.report.figures import beta_response, learning_curves, paired_differences
+from rcdsac_trl.report.page import Part, page
+from rcdsac_trl.report.read import METRIC_NAMES, Episodes
+from rcdsac_trl.report.statistics import CONFIDENCE, PERMUTATIONS
+
+
+def write_report(episodes: Episodes, folders: Sequence[Path], out: Path) -> None:
+    """Write everything.
+
+    Args:
+        episodes: of all evaluations.
+        folders: as they were named; learning curves are drawn of those that are runs.
+        out: the folder; it may exist.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paper = table.comparison(episodes)
+    table.write_table(paper, out / "table")
+    summary, pairs, trends = findings.summary(episodes), findings.comparisons(episodes), findings.trends(episodes)
+    means = pd.concat([table.averages(table.paper_table()).assign(source="paper"), _own_averages(episodes)])
+    for name, values in (("summary", summary), ("comparisons", pairs), ("trends", trends), ("averages", means)):
+        values.to_csv(out / f"{name}.csv", index=False, float_format="%.6g")
+    figures = _figures(episodes, folders)
+    for name, figure in figures.items():
+        figure.savefig(out / f"{name}.png", dpi=130)
+    sections = _sections(episodes, paper, summary, pairs, trends, means, figures)
+    (out / "report.html").write_text(page("What was found", sections))
+
+
+def _own_averages(episodes: Episodes) -> pd.DataFrame:
+    return table.averages(table.own_table(episodes)).assign(source="here")
+
+
+def _figures(episodes: Episodes, folders: Sequence[Path]) -> dict[str, Figure]:
+    figures: dict[str, Figure] = {}
+    for measure in episodes.conditions["measure"].dropna().unique():
+        if (figure := beta_response(episodes, measure)) is not None:
+            figures[f"beta_response_{measure}"] = figure
+    agents = episodes.conditions["agent"].tolist()
+    if len(agents) > 1:
+        # What all others are compared with: the baseline that knows no risk, if it is there.
+        reference = next((agents.index(name) for name in ("sac", "pursuit") if name in agents), 0)
+        for metric in ("collisions", "reward"):
+            figures[f"differences_{metric}"] = paired_differences(episodes, reference, metric)
+    if runs := learning.validation_of_runs(folders):
+        figures["learning_curves"] = learning_curves(runs)
+    return figures
+
+
+def _sections(
+    episodes: Episodes,
+    paper: pd.DataFrame,
+    summary: pd.DataFrame,
+    pairs: pd.DataFrame,
+    trends: pd.DataFrame,
+    means: pd.DataFrame,
+    figures: dict[str, Figure],
+) -> list[tuple[str, list[Part]]]:
+    kept = episodes.protocol
+    maps, each = kept["num_maps"], kept["num_episodes"]
+    seeds = episodes.table.groupby(["agent", "sensor", "beta", "collision_weight"], dropna=False)[
+        "train_seed"
+    ].nunique()
+    learnt: list[Part] = [figure for name, figure in figures.items() if name == "learning_curves"]
+    sections: list[tuple[str, list[Part]]] = [
+        (
+            "The table",
+            [
+                f"Mean ± standard deviation over {maps * each} episodes a training seed: {maps} {kept['split']} maps x "
+                f"{each}, root seed {kept['seed']}. Every agent met the same maps, starts and goals. Training seeds an "
+                f"agent and setting: {seeds.min()}" + ("." if seeds.min() == seeds.max() else f" to {seeds.max()}."),
+                "The paper's numbers come from its own maps, which are not available: read them beside ours as an "
+                "order of magnitude, and compare the agents of one source with each other.",
+                paper,
+                "Averages over both risk measures at the two settings of each that DSAC has, as in the paper's text.",
+                _text(means),
+            ],
+        ),
+        (
+            "What beta does",
+            [
+                "Shaded: where the value lies with "
+                f"{CONFIDENCE:.0%} confidence, if other maps of the same kind had been drawn.",
+                *(figure for name, figure in figures.items() if name.startswith("beta_response")),
+                "Does it hold map by map? Page's test for an order, maps as blocks. Correlation 1 means that the "
+                f"metric rises with beta on every map, -1 that it falls on every map. p-values by {PERMUTATIONS:,} "
+                "permutations within the maps, two-sided, one test at a time.",
+                _text(trends) if len(trends) else "No agent was driven at three betas or more.",
+            ],
+        ),
+        (
+            "Who is better than whom",
+            [
+                *(figure for name, figure in figures.items() if name.startswith("differences")),
+                "`better` is the probability that an episode of the first agent beats one of the second on the same "
+                "map (fewer collisions, more reward). p-values: sign permutations over maps, adjusted by Holm's method "
+                "for the number of pairs. With one training seed they speak of these trained agents, not of the "
+                "algorithms.",
+                _text(pairs) if len(pairs) else "There is only one agent.",
+            ],
+        ),
+        (
+            "Everything measured",
+            [
+                f"Value [{CONFIDENCE:.0%} interval over maps, and over training seeds where there are several].",
+                _wide(summary),
+            ],
+        ),
+    ]
+    return [*sections, ("Learning", learnt)] if learnt else sections
+
+
+def _wide(summary: pd.DataFrame) -> pd.DataFrame:
+    """Lay the summary out with a column a condition."""
+    cells = summary.assign(
+        text=[f"{row.value:.3g} [{row.low:.3g}, {row.high:.3g}]" for row in summary.itertuples(index=False)],
+        statistic=summary["statistic"].map(lambda name: METRIC_NAMES.get(name, name)),
+    )
+    wide = cells.pivot(index="statistic", columns="condition", values="text")
+    ordered = wide.loc[cells["statistic"].drop_duplicates(), cells["condition"].drop_duplicates()]
+    return ordered.rename_axis(None, axis=1).reset_index()
+
+
+def _text(values: pd.DataFrame) -> pd.DataFrame:
+    """Write numbers with three digits."""
+    return values.map(lambda value: f"{value:.3g}" if isinstance(value, float) else str(value))

@@ -1,0 +1,257 @@
+"""Reports: the paper's own averages, refusals, and a whole report of made-up evaluations."""
+
+import json
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.report import __main__ as command
+from rcdsac_trl.report import findings, statistics, table
+from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.write import write_report
+
+MAPS, EPISODES = 6, 3
+PROTOCOL = {
+    "split": "evaluation",
+    "seed": 0,
+    "num_maps": MAPS,
+    "num_episodes": EPISODES,
+    "sampled": False,
+    "map": {"version": 1, "size_m": 20.0},
+    "task": {"episode_steps": 1000},
+}
+
+
+def evaluate(
+    folder: Path,
+    agent: str,
+    told: dict[float, float],
+    *,
+    column: str = "beta",
+    train_seed: int = 0,
+    **described: object,
+) -> Path:
+    """Write an evaluation whose collisions are, at each setting, 0, 1, 2, .. plus a number, over and over."""
+    rows = [
+        {"beta": np.nan, "collision_weight": np.nan}
+        | ({} if np.isnan(setting) else {column: setting})
+        | {
+            "map": m,
+            "episode": e,
+            "collisions": e + more,
+            "reward": 100.0 * m + 10 * e - 5 * more,
+            "goals": 2,
+            "mean_speed_m_per_s": 0.4 + 0.01 * more,
+        }
+        for setting, more in told.items()
+        for m in range(MAPS)
+        for e in range(EPISODES)
+    ]
+    folder.mkdir(parents=True)
+    pd.DataFrame(rows).to_csv(folder / "episodes.csv", index=False)
+    measure = {"rcdsac_pow": "pow", "dsac_pow": "pow"}.get(agent)
+    says = PROTOCOL | {"agent": agent, "sensor": "narrow", "measure": measure, "train_seed": train_seed} | described
+    (folder / "evaluation.json").write_text(json.dumps(says))
+    return folder
+
+
+NONE = float("nan")
+
+
+@pytest.fixture(autouse=True)
+def _few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How well intervals and p-values are estimated is not the matter here."""
+    monkeypatch.setattr(statistics, "DRAWS", 50)
+    monkeypatch.setattr(statistics, "PERMUTATIONS", 500)
+
+
+# ------------------------------------------------------------------------------------------------ the paper's numbers
+def test_the_averages_of_the_papers_text_come_out_of_its_table() -> None:
+    found = table.averages(table.paper_table()).set_index(["name", "sensor"])
+
+    def average(name: str, sensor: str) -> tuple[float, float]:
+        row = found.loc[(name, sensor)]
+        return row["collisions"], row["reward"]
+
+    # Section "Performance Comparison"; it rounds, once upwards from exactly one half.
+    assert average("DSAC", "narrow") == pytest.approx((0.91, 425.0), abs=0.051)
+    assert average("RC-DSAC (stored)", "narrow") == pytest.approx((0.95, 449.9), abs=0.0051)
+    assert average("DSAC", "sparse") == pytest.approx((0.68, 492.9), abs=0.051)
+    assert average("RC-DSAC (stored)", "sparse") == pytest.approx((0.44, 498.1), abs=0.051)
+    assert average("RC-DSAC (resample)", "narrow") == pytest.approx((0.64, 470.0), abs=0.0051)
+    assert average("RC-DSAC (resample)", "sparse")[0] == pytest.approx(0.26, abs=0.0051)
+    assert len(found) == 6
+
+
+def test_the_paper_has_twenty_four_rows_for_each_sensor() -> None:
+    paper = table.paper_table()
+    assert paper.groupby("sensor").size().to_dict() == {"narrow": 24, "sparse": 24}
+    # What the paper says of its own table.
+    narrow = paper[paper["sensor"] == "narrow"].set_index(["agent", "beta"])
+    assert narrow["reward_mean"].idxmax() == ("rcdsac_pow", -1.0)
+    for _, part in paper.groupby("sensor"):
+        assert tuple(part.loc[part["collisions_mean"].idxmin(), ["agent", "beta"]]) == ("rcdsac_pow", -1.5)
+    sac = narrow.loc["sac", "collisions_mean"].iloc[0]
+    assert (narrow.drop(index=["sac", "rcwr"])["collisions_mean"] < sac).all()
+
+
+# ------------------------------------------------------------------------------------------------ our table
+def test_our_cells_are_mean_and_deviation_over_all_episodes(tmp_path: Path) -> None:
+    evaluate(tmp_path / "a", "rcwr", {1.5: 0}, column="collision_weight")
+    evaluate(tmp_path / "b", "rcdsac_pow", {-1.0: 1, -2.0: 0})
+    evaluate(tmp_path / "c", "mine", {NONE: 0}, sensor="full")
+    shown = table.comparison(read_episodes([tmp_path / name for name in "abc"]))
+    assert shown[("", "agent")].tolist() == ["RC-DSAC (resample)", "RC-DSAC (resample)", "RCWR", "mine"]
+    assert shown[("", "β")].tolist() == ["-2", "-1", "w_coll = 1.5", ""]
+    assert shown[("narrow", "collisions")].tolist() == ["1.00 ± 0.82", "2.00 ± 0.82", "1.00 ± 0.82", ""]
+    assert shown[("narrow", "collisions, paper")].tolist() == ["0.50 ± 0.84", "0.58 ± 1.36", "1.50 ± 2.39", ""]
+    rewards = np.array([100.0 * m + 10 * e for m in range(MAPS) for e in range(EPISODES)])
+    assert shown[("narrow", "reward")].iloc[0] == f"{rewards.mean():.1f} ± {rewards.std():.1f}"
+    assert shown[("full", "collisions")].tolist() == ["", "", "", "1.00 ± 0.82"]
+    assert not any(sensor == "sparse" for sensor, _ in shown.columns)
+
+
+def test_the_four_formats_hold_every_cell(tmp_path: Path) -> None:
+    evaluate(tmp_path / "a", "rcdsac_pow", {-2.0: 0})
+    shown = table.comparison(read_episodes([tmp_path / "a"]))
+    table.write_table(shown, tmp_path / "table")
+    for suffix, cell in (("md", "| 1.00 ± 0.82 |"), ("csv", ",1.00 ± 0.82,"), ("html", "<td>1.00 ± 0.82</td>")):
+        assert cell in (tmp_path / f"table.{suffix}").read_text()
+    tex = (tmp_path / "table.tex").read_text()
+    assert r"RC-DSAC (resample) & pow & $-$2 & 1.00 $\pm$ 0.82 & 0.50 $\pm$ 0.84" in tex
+    assert tex.count(r"\\") == 3
+    assert pd.read_csv(tmp_path / "table.csv").shape == shown.shape
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"seed": 1}, "seed is 0 and 1"),
+        ({"split": "validation"}, "split is evaluation and validation"),
+        ({"map": {"version": 2, "size_m": 20.0}}, "map.version is 1 and 2"),
+        ({"task": {"episode_steps": 500}}, "task.episode_steps is 1000 and 500"),
+        ({"num_maps": 7}, "num_maps is 6 and 7"),
+        ({"sampled": True}, "sampled is False and True"),
+    ],
+)
+def test_other_maps_starts_or_rules_are_refused(tmp_path: Path, changed: dict, sentence: str) -> None:
+    a, b = evaluate(tmp_path / "a", "sac", {NONE: 0}), evaluate(tmp_path / "b", "rcdsac_pow", {-1.0: 0}, **changed)
+    with pytest.raises(UserInputError, match=f"did not meet the same maps, starts and goals .{sentence}"):
+        read_episodes([a, b])
+
+
+def test_the_same_agent_twice_is_refused_but_another_training_seed_is_not(tmp_path: Path) -> None:
+    a, b = evaluate(tmp_path / "a", "sac", {NONE: 0}), evaluate(tmp_path / "b", "sac", {NONE: 2})
+    with pytest.raises(UserInputError, match="hold the same agent, training seed and beta"):
+        read_episodes([a, b])
+    c = evaluate(tmp_path / "c", "sac", {NONE: 2}, train_seed=1)
+    episodes = read_episodes([a, c])
+    values = episodes.of(episodes.conditions.iloc[0], "collisions")
+    assert values.shape == (2, MAPS, EPISODES)
+    assert values.mean((1, 2)).tolist() == [1.0, 3.0]
+
+
+def test_what_is_no_evaluation_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match="name what to report on"):
+        read_episodes([])
+    with pytest.raises(UserInputError, match=r"holds no evaluation\.json"):
+        read_episodes([tmp_path])
+    folder = evaluate(tmp_path / "a", "sac", {NONE: 0})
+    rows = pd.read_csv(folder / "episodes.csv")
+    rows[:-1].to_csv(folder / "episodes.csv", index=False)
+    with pytest.raises(UserInputError, match="holds 17 episodes of a beta instead of 18"):
+        read_episodes([folder])
+    rows.drop(columns="map").to_csv(folder / "episodes.csv", index=False)
+    with pytest.raises(UserInputError, match="does not say map"):
+        read_episodes([folder])
+    (folder / "evaluation.json").write_text("{")
+    with pytest.raises(UserInputError, match="cannot be read"):
+        read_episodes([folder])
+
+
+# ------------------------------------------------------------------------------------------------ findings
+def test_findings_by_hand(tmp_path: Path) -> None:
+    evaluate(tmp_path / "a", "rcdsac_pow", {-2.0: 0, -1.0: 1, -0.5: 2})
+    episodes = read_episodes([tmp_path / "a"])
+    summary = findings.summary(episodes).set_index(["condition", "statistic"])["value"]
+    averse = "RC-DSAC (resample) pow β = -2"
+    assert summary[averse, "collisions"] == 1.0
+    assert summary[averse, "collision_free"] == pytest.approx(1 / 3)  # the first of three episodes a map
+    assert summary[averse, "reward, mean of the worst 25%"] == pytest.approx((0 + 10 + 20 + 100 + 0.5 * 110) / 4.5)
+    pairs = findings.comparisons(episodes).set_index(["first", "second", "metric"])
+    first = pairs.loc[(averse, "RC-DSAC (resample) pow β = -1", "collisions")]
+    assert (first["difference"], first["low"], first["high"]) == (-1.0, -1.0, -1.0)
+    # 0 1 2 against 1 2 3: fewer in 6 of 9 pairs, equal in 2.
+    assert first["better"] == pytest.approx((6 + 1) / 9)
+    trends = findings.trends(episodes).set_index("metric")
+    assert trends["correlation"].round(9).to_dict() == {
+        "collisions": 1.0,
+        "mean_speed_m_per_s": 1.0,
+        "goals": 0.0,
+        "reward": -1.0,
+        "worst_reward": -1.0,
+    }
+    assert trends.loc["collisions", "p_value"] < 0.01
+    assert trends.loc["goals", "p_value"] == 1.0
+
+
+class Images(HTMLParser):
+    """Counts what a page shows and what it would fetch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.tables = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tables += tag == "table"
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+
+
+def run_folder(path: Path) -> Path:
+    """Make a run that has validated twice and was evaluated."""
+    evaluate(path / "evaluation" / "best", "rcdsac_pow", {-2.0: 0, -1.0: 1, -0.5: 2})
+    (path / "csv" / "scalars" / "time").mkdir(parents=True)
+    (path / "csv" / "scalars" / "time" / "elapsed_s.csv").write_text("1000,60.0\n2000,120.0\n")
+    rows = [
+        {"iteration": i, "updates": 10 * (i + 1), "beta": -1.0, "collisions": 2 - i, "reward": 100 * i} for i in (0, 1)
+    ]
+    pd.DataFrame(rows).to_csv(path / "validation_episodes.csv", index=False)
+    return path
+
+
+def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
+    folders = [run_folder(tmp_path / "run"), evaluate(tmp_path / "sac", "sac", {NONE: 3})]
+    out = tmp_path / "out"
+    write_report(read_episodes(folders), folders, out)
+    assert {path.name for path in out.iterdir()} == {
+        *(f"table.{suffix}" for suffix in ("md", "csv", "tex", "html")),
+        *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "averages")),
+        *(f"{name}.png" for name in ("beta_response_pow", "differences_collisions", "differences_reward")),
+        "learning_curves.png",
+        "report.html",
+    }
+    page = Images()
+    page.feed((out / "report.html").read_text())
+    assert len(page.sources) == 4
+    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
+    assert page.tables == 5
+
+
+def test_the_command_refuses_before_it_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else the process would start itself again
+    monkeypatch.setattr(sys, "argv", ["report", "runs=[nowhere]"])
+    with pytest.raises(SystemExit) as left:
+        command.main()
+    assert left.value.code == 2
+    assert "nowhere holds no evaluation.json" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
