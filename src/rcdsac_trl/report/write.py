@@ -44,15 +44,18 @@ def _figures(episodes: Episodes, folders: Sequence[Path]) -> dict[str, Figure]:
     for measure in episodes.conditions["measure"].dropna().unique():
         if (figure := beta_response(episodes, measure)) is not None:
             figures[f"beta_response_{measure}"] = figure
-    agents = episodes.conditions["agent"].tolist()
-    if len(agents) > 1:
-        # What all others are compared with: the baseline that knows no risk, if it is there.
-        reference = next((agents.index(name) for name in ("sac", "pursuit") if name in agents), 0)
+    if len(episodes.conditions) > 1:
         for metric in ("collisions", "reward"):
-            figures[f"differences_{metric}"] = paired_differences(episodes, reference, metric)
+            figures[f"differences_{metric}"] = paired_differences(episodes, _reference(episodes), metric)
     if runs := learning.validation_of_runs(folders):
         figures["learning_curves"] = learning_curves(runs)
     return figures
+
+
+def _reference(episodes: Episodes) -> int:
+    """Choose the condition that all others are compared with: the baseline that knows no risk, if it is there."""
+    agents = episodes.conditions["agent"].tolist()
+    return next((agents.index(name) for name in ("sac", "pursuit") if name in agents), 0)
 
 
 def _sections(
@@ -69,6 +72,8 @@ def _sections(
     seeds = episodes.table.groupby(["agent", "sensor", "beta", "collision_weight"], dropna=False)[
         "train_seed"
     ].nunique()
+    reference = findings.labels(episodes)[_reference(episodes)]
+    shown = pairs[(pairs["first"] == reference) | (pairs["second"] == reference)] if len(pairs) else pairs
     learnt: list[Part] = [figure for name, figure in figures.items() if name == "learning_curves"]
     sections: list[tuple[str, list[Part]]] = [
         (
@@ -104,7 +109,8 @@ def _sections(
                 "map (fewer collisions, more reward). p-values: sign permutations over maps, adjusted by Holm's method "
                 "for the number of pairs. With one training seed they speak of these trained agents, not of the "
                 "algorithms.",
-                _text(pairs) if len(pairs) else "There is only one agent.",
+                _text(shown) if len(shown) else "There is only one agent.",
+                "All other pairs are in comparisons.csv.",
             ],
         ),
         (
@@ -119,13 +125,13 @@ def _sections(
 
 
 def _wide(summary: pd.DataFrame) -> pd.DataFrame:
-    """Lay the summary out with a column a condition."""
+    """Lay the summary out with a row a condition."""
     cells = summary.assign(
         text=[f"{row.value:.3g} [{row.low:.3g}, {row.high:.3g}]" for row in summary.itertuples(index=False)],
         statistic=summary["statistic"].map(lambda name: METRIC_NAMES.get(name, name)),
     )
-    wide = cells.pivot(index="statistic", columns="condition", values="text")
-    ordered = wide.loc[cells["statistic"].drop_duplicates(), cells["condition"].drop_duplicates()]
+    wide = cells.pivot(index="condition", columns="statistic", values="text")
+    ordered = wide.loc[cells["condition"].drop_duplicates(), cells["statistic"].drop_duplicates()]
     return ordered.rename_axis(None, axis=1).reset_index()
 
 
