@@ -42,6 +42,15 @@ def test_episodes_of_one_map_are_no_independent_observations() -> None:
     assert interval.high - interval.low == pytest.approx(expected, rel=0.1)
 
 
+def test_means_of_all_draws_at_once_are_those_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(7).normal(0.0, 1.0, (2, 5, 3))
+    values[0, 1, :] = values[1, 2, 0] = np.nan
+    monkeypatch.setattr(statistics, "DRAWS", 100)
+    assert statistics.bootstrap(values, lambda drawn: float(np.nanmean(drawn))) == statistics.Interval(
+        *(pytest.approx(number) for number in vars(statistics.bootstrap(values)).values())
+    )
+
+
 def test_seeds_that_differ_widen_the_interval() -> None:
     maps = np.random.default_rng(2).normal(0.0, 1.0, (1, 30, 1))
     alike = statistics.bootstrap(np.concatenate([maps, maps, maps]))

@@ -113,10 +113,14 @@ def bootstrap(values: Array, statistic: Statistic = mean) -> Interval:
     """
     rng = np.random.default_rng(_SEED)
     seeds, maps, _ = values.shape
-    drawn = np.empty(DRAWS)
-    for i in range(DRAWS):
-        seed = rng.integers(seeds, size=(seeds, 1))
-        drawn[i] = statistic(values[seed, rng.integers(maps, size=(seeds, maps))])
+    seed = rng.integers(seeds, size=(DRAWS, seeds, 1))
+    map_ = rng.integers(maps, size=(DRAWS, seeds, maps))
+    if statistic is mean:  # of all draws at once, from the sums of maps
+        counts, sums = np.isfinite(values).sum(2), np.nansum(values, 2)
+        totals = counts[seed, map_].sum((1, 2))
+        drawn = np.divide(sums[seed, map_].sum((1, 2)), totals, out=np.full(DRAWS, np.nan), where=totals > 0)
+    else:
+        drawn = np.array([statistic(values[seed[i], map_[i]]) for i in range(DRAWS)])
     return _interval(statistic(values), drawn)
 
 
