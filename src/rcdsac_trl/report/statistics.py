@@ -6,6 +6,7 @@ Values come as arrays ``[S, M, E]``: training seeds, maps, episodes on a map.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,12 +135,10 @@ def compare(first: Array, second: Array) -> Comparison:
         first: ``[S, M, E]``.
         second: ``[S', M, E]``, the same maps, starts and goals.
     """
-    rng = np.random.default_rng(_SEED)
     differences = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
     improvements = _improvements(first, second)
-    chosen = rng.integers(len(differences), size=(DRAWS, len(differences)))
-    signs = rng.choice([-1.0, 1.0], size=(PERMUTATIONS, len(differences)))
-    as_extreme = np.abs((signs * differences).mean(1)) >= abs(differences.mean()) - 1e-12
+    chosen, signs = _resamples(len(differences), DRAWS, PERMUTATIONS)
+    as_extreme = np.abs(signs @ differences) >= abs(differences.sum()) - 1e-9
     return Comparison(
         difference=_interval(differences.mean(), differences[chosen].mean(1)),
         improvement=_interval(improvements.mean(), improvements[chosen].mean(1)),
@@ -191,6 +190,13 @@ def holm(p_values: list[float]) -> list[float]:
         largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
         adjusted[i] = largest
     return adjusted
+
+
+@lru_cache(maxsize=4)
+def _resamples(maps: int, draws: int, permutations: int) -> tuple[NDArray[np.int64], Array]:
+    """Draw maps ``[draws, maps]`` and signs ``[permutations, maps]``: the same for every pair of a report."""
+    rng = np.random.default_rng(_SEED)
+    return rng.integers(maps, size=(draws, maps)), rng.choice([-1.0, 1.0], size=(permutations, maps))
 
 
 def _improvements(first: Array, second: Array) -> Array:
