@@ -233,7 +233,10 @@ def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir()} == {
         *(f"table.{suffix}" for suffix in ("md", "csv", "tex", "html")),
         *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "averages")),
-        *(f"{name}.png" for name in ("beta_response_pow", "differences_collisions", "differences_reward")),
+        *(
+            f"{name}.png"
+            for name in ("beta_response_pow", "differences_collisions_narrow", "differences_reward_narrow")
+        ),
         "learning_curves.png",
         "report.html",
     }

@@ -65,8 +65,9 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
         axes.set_xticks(sorted(told["beta"].unique()))
         if metric != "reward":
             axes.set_ylim(bottom=0)
-        if len(groups) > 1 and metric == "collisions":
-            axes.legend(frameon=False, fontsize=9, labelcolor=INK)
+    if len(groups) > 1:
+        handles, names = axes.get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
 

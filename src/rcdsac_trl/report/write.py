@@ -44,18 +44,26 @@ def _figures(episodes: Episodes, folders: Sequence[Path]) -> dict[str, Figure]:
     for measure in episodes.conditions["measure"].dropna().unique():
         if (figure := beta_response(episodes, measure)) is not None:
             figures[f"beta_response_{measure}"] = figure
-    if len(episodes.conditions) > 1:
+    for sensor, reference in _references(episodes).items():
         for metric in ("collisions", "reward"):
-            figures[f"differences_{metric}"] = paired_differences(episodes, _reference(episodes), metric)
+            figures[f"differences_{metric}_{sensor}"] = paired_differences(episodes, reference, metric)
     if runs := learning.validation_of_runs(folders):
         figures["learning_curves"] = learning_curves(runs)
     return figures
 
 
-def _reference(episodes: Episodes) -> int:
-    """Choose the condition that all others are compared with: the baseline that knows no risk, if it is there."""
-    agents = episodes.conditions["agent"].tolist()
-    return next((agents.index(name) for name in ("sac", "pursuit") if name in agents), 0)
+def _references(episodes: Episodes) -> dict[str, int]:
+    """Choose the condition that all others of a sensor are compared with: a baseline that knows no risk, if any.
+
+    A sensor with one condition has none.
+    """
+    chosen = {}
+    for sensor, conditions in episodes.conditions.groupby("sensor", sort=False):
+        agents = conditions["agent"].tolist()
+        if len(agents) > 1:
+            at = next((agents.index(name) for name in ("sac", "pursuit") if name in agents), 0)
+            chosen[str(sensor)] = int(conditions.index[at])
+    return chosen
 
 
 def _sections(
@@ -72,8 +80,9 @@ def _sections(
     seeds = episodes.table.groupby(["agent", "sensor", "beta", "collision_weight"], dropna=False)[
         "train_seed"
     ].nunique()
-    reference = findings.labels(episodes)[_reference(episodes)]
-    shown = pairs[(pairs["first"] == reference) | (pairs["second"] == reference)] if len(pairs) else pairs
+    names = findings.labels(episodes)
+    with_reference = [names[i] for i in _references(episodes).values()]
+    shown = pairs[pairs["first"].isin(with_reference) | pairs["second"].isin(with_reference)] if len(pairs) else pairs
     learnt: list[Part] = [figure for name, figure in figures.items() if name == "learning_curves"]
     sections: list[tuple[str, list[Part]]] = [
         (
