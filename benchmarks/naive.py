@@ -15,10 +15,10 @@ import bench_world as bench
 def _make_naive() -> None:
     """Make every simulation of this process a naive one."""
     from rcdsac_trl.interface import MAX_RANGE_M, NUM_BINS
-    from rcdsac_trl.world import simulation
+    from rcdsac_trl.world import bodies, simulation
     from rcdsac_trl.world.bullet import pybullet
 
-    simulation.SHAPES_PER_BODY = 1
+    bodies.SHAPES_PER_BODY = 1
 
     def scan(self: Any) -> np.ndarray:
         x, y, yaw = self.pose
