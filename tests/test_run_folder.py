@@ -22,6 +22,7 @@ STARTER = """
 import sys, time
 from pathlib import Path
 from rcdsac_trl import train
+from rcdsac_trl.pipeline import logs
 
 mine, other = Path(sys.argv.pop(1)), Path(sys.argv.pop(1))
 check_folder = logs.check_folder

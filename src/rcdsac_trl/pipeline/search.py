@@ -166,10 +166,10 @@ class Search:
 
     @staticmethod
     def _is_alive(folder: Path) -> bool:
+        if not folder.is_dir():
+            return False
         try:
             FolderLock(folder).close()
-        except FileNotFoundError:
-            return False
         except UserInputError:
             return True
         return False
