@@ -215,6 +215,7 @@ RUN = "run=<the tiny run>"
         ([RUN, "beta=[-1]", "sampled=often"], "sampled=often must be true or false"),
         ([RUN, "beta=[-1]", "num_maps=0"], "num_maps=0 must be at least 1"),
         ([RUN, "beta=[-1]", "num_episodes=1.5"], "num_episodes=1.5 must be a whole number"),
+        ([RUN, "beta=[-1]", "out="], "out names no folder: give it one, or leave it out"),
         ([RUN, "beta=[-1]", "seed=-1"], "seed=-1 must be at least 0"),
         ([RUN, "beta=[-1]", "num_workers=-3"], "num_workers=-3 is not a number of processes"),
         ([RUN, "beta=[-1]", "threads=all"], "threads=all must be a whole number or auto"),

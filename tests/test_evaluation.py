@@ -93,6 +93,16 @@ def test_sampled_actions_repeat_too(run: Path, tmp_path: Path) -> None:
     assert contents(evaluate(*given, f"out={tmp_path / 'b'}")) == first
 
 
+def test_it_never_mixes_with_what_another_wrote_meanwhile(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    sizes = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1"]
+    later = build.evaluation(compose("evaluate", [f"run={run}", "beta=[-2]", f"out={out}", *sizes]))
+    before = contents(evaluate(f"run={run}", "beta=[-1]", f"out={out}"))
+    with pytest.raises(UserInputError, match="holds the evaluation of something else"):
+        later.run()
+    assert contents(out) == before
+
+
 def test_it_refuses_to_overwrite_another_evaluation(run: Path, tmp_path: Path) -> None:
     out = evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     before = contents(out)

@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.metrics import Condition, episode_metrics, summarise
@@ -141,15 +142,21 @@ class EvaluationRun:
         check_out(out, "evaluation.json", self.described)
 
     def run(self) -> None:
-        """Drive, write, and print the summary."""
+        """Drive, print the summary, and write.
+
+        Raises:
+            UserInputError: if another evaluation was written into the folder meanwhile.
+        """
         # Closed here and now where Ctrl-C comes between two maps, and with them what drives.
         with contextlib.closing(self.maps()) as maps:
             episodes = table_of(tqdm(maps, total=self.num_maps, unit="map", disable=None))
         summary = summarise(episodes, ["beta", "collision_weight"])
-        self.out.mkdir(parents=True, exist_ok=True)
-        episodes.to_csv(self.out / "episodes.csv", index=False, float_format="%.9g")
-        summary.to_csv(self.out / "summary.csv", index=False, float_format="%.6g")
-        (self.out / "evaluation.json").write_text(self.described)
         shown = summary.dropna(axis="columns", how="all").set_index("episodes")
         print(shown.T.to_string(header=True, float_format="%.3f"))
+        check_out(self.out, "evaluation.json", self.described)
+        self.out.mkdir(parents=True, exist_ok=True)
+        durable.write(self.out / "episodes.csv", episodes.to_csv(index=False, float_format="%.9g").encode())
+        durable.write(self.out / "summary.csv", summary.to_csv(index=False, float_format="%.6g").encode())
+        # Last: a folder that has this one has them all.
+        durable.write(self.out / "evaluation.json", self.described.encode())
         print(f"written to {self.out}")

@@ -219,6 +219,8 @@ class EvaluationSettings:
         """Refuse what is below its limit, and neither or both of run and baseline."""
         if (self.run is None) == (self.baseline is None):
             raise UserInputError("name what to evaluate: either run=<folder> or baseline=pursuit")
+        if self.out == "":
+            raise UserInputError("out names no folder: give it one, or leave it out")
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
         _check_least("seed", self.seed, 0)
