@@ -76,23 +76,30 @@ def test_a_gradient_that_is_not_finite_ends_the_run_although_the_losses_are(tmp_
 
 
 @pytest.mark.parametrize(
-    ("key", "name"),
-    [("range", "range"), (("next", "velocity"), "next.velocity"), (("next", "reward"), "next.reward")],
+    ("key", "step", "name"),
+    [
+        ("range", 0, "range"),
+        (("next", "range"), 7, "next.range"),
+        (("next", "velocity"), 7, "next.velocity"),
+        (("next", "reward_components"), 7, "next.reward_components"),
+    ],
 )
-def test_an_episode_that_is_not_finite_is_never_stored(tmp_path: Path, key: str | tuple[str, str], name: str) -> None:
+def test_an_episode_that_is_not_finite_is_never_stored(
+    tmp_path: Path, key: str | tuple[str, str], step: int, name: str
+) -> None:
     trainer = tiny_trainer(tmp_path / "run")
     collect = trainer.episodes.collect
 
     def spoilt(iteration: int, map_index: int) -> TensorDictBase:
         batch = collect(iteration, map_index)
-        batch[key][1, 7, 0] = -math.inf
+        batch[key][1, step, 0] = -math.inf
         return batch
 
     trainer.episodes.collect = spoilt  # type: ignore[method-assign]
-    assert failing(trainer).startswith(f"{name} of episode 1 at step 7 is NaN or infinite in iteration 0: training st")
+    assert failing(trainer).startswith(f"{name} of episode 1 at step {step} is NaN or infinite in iteration 0: ")
     assert len(trainer.learner.replay) == 0
     dump = load_failure(tmp_path / "run" / "failure" / "iteration-000000", make_loss(tiny_settings(), "cpu"))
-    assert dump[key][1, 7, 0] == -math.inf
+    assert dump[key][1, step, 0] == -math.inf
     assert dump[key].isfinite().sum() == dump[key].numel() - 1
 
 
