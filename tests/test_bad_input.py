@@ -288,7 +288,7 @@ def test_damage_to_a_checkpoint_never_changes_weights_in_silence(few: int, run: 
     holds()
 
 
-@pytest.mark.parametrize("few", [10, pytest.param(500, marks=MANY)])
+@pytest.mark.parametrize("few", [10, pytest.param(150, marks=MANY)])
 @pytest.mark.parametrize("name", ["config.yaml", "manifest.json"])
 def test_a_damaged_run_folder_is_read_or_refused(few: int, name: str, run: Path) -> None:
     path = run / name

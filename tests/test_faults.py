@@ -19,8 +19,9 @@ import torch
 from tensordict import TensorDictBase
 
 from rcdsac_trl import train
-from rcdsac_trl.errors import TrainingError
+from rcdsac_trl.errors import TrainingError, UserInputError
 from rcdsac_trl.pipeline import build, resources
+from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, newest
 from rcdsac_trl.pipeline.team_processes import Request, TeamProcesses
 from rcdsac_trl.pipeline.teams import Driven
@@ -340,7 +341,7 @@ def test_a_replay_larger_than_the_memory_is_refused_before_anything_is_written(
     # 5,000 episodes of 1,001 slots, each of 43 bins of 2 bytes and 6 + 4 + 2 + 1 + 1 + 1 numbers of 4: 0.73 GB
     assert (code, err) == (
         2,
-        "rcdsac_trl: the replay needs 0.7 GB of memory, 0.5 GB are available: lower replay.capacity_steps, or end "
+        "rcdsac_trl: the replay: 0.7 GB of memory needed, 0.5 GB available: lower replay.capacity_steps, or end "
         "other programs\n",
     )
     assert list(tmp_path.iterdir()) == []
@@ -351,8 +352,23 @@ def test_a_mini_batch_larger_than_any_memory_is_refused(
 ) -> None:
     code, err = command("+algo=sac", "preset=smoke", "learner.batch_size=1000000000", f"hydra.run.dir={tmp_path}/run")
     assert code == 2
-    assert err.startswith("rcdsac_trl: a mini-batch needs 6480.0 GB of memory, ")  # (8 + 1) * 180 * 4 bytes each
-    assert err.endswith(" GB are available: lower learner.batch_size, or end other programs\n")
+    assert err.startswith("rcdsac_trl: a mini-batch: 6480.0 GB of memory needed, ")  # (8 + 1) * 180 * 4 bytes each
+    assert err.endswith(" GB available: lower learner.batch_size, or end other programs\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_more_simulations_than_the_memory_holds_are_refused(
+    tmp_path: Path, command: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rcdsac_trl.pipeline.resources.available_memory_bytes", lambda: 4_000_000_000)
+    code, err = command("+algo=sac", "preset=smoke", "world.num_agents=100", f"hydra.run.dir={tmp_path}/run")
+    assert code == 2  # 100 that train and 100 that validate, 28 MB each
+    assert err == (
+        "rcdsac_trl: 200 simulations: 5.6 GB of memory needed, 4.0 GB available: lower world.num_agents, or end other "
+        "programs\n"
+    )
+    with pytest.raises(UserInputError, match=r"^3000 simulations: 84\.0 GB of memory needed, 4\.0 GB available: lower"):
+        build.evaluation(compose("evaluate", ["baseline=pursuit", "num_episodes=1000", "num_workers=3"]))
     assert list(tmp_path.iterdir()) == []
 
 

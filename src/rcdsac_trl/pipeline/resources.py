@@ -103,9 +103,7 @@ def check_memory(what: str, needed_bytes: int, remedy: str) -> None:
     """
     available = available_memory_bytes()
     if available is not None and needed_bytes > available:
-        raise UserInputError(
-            f"{what} needs {_size(needed_bytes)} of memory, {_size(available)} are available: {remedy}"
-        )
+        raise UserInputError(f"{what}: {_size(needed_bytes)} of memory needed, {_size(available)} available: {remedy}")
 
 
 def disk_shortage(folder: Path, needed_bytes: int) -> str | None:

@@ -22,6 +22,8 @@ from rcdsac_trl.world.lidar import scan
 from rcdsac_trl.world.maps import Map
 from rcdsac_trl.world.movers import Movers, WalkPlanner
 
+SIMULATION_BYTES = 28_000_000
+"""Memory that PyBullet takes for a simulation, however empty; where there is none left, it ends the process."""
 CONTACT_DISTANCE_M = 1e-3
 """The robot is in contact with what is nearer than this.
 
@@ -82,6 +84,8 @@ class Simulation:
             self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         except pybullet.error:
             self._client = -1
+        if self._client < 0 and not gui:
+            raise UserInputError("PyBullet opens no more simulations in one process: use fewer agents or more workers")
         if self._client < 0:
             raise UserInputError("PyBullet could not open its window: gui=true needs a display; use gui=false")
         self._pose = (0.0, 0.0, 0.0)

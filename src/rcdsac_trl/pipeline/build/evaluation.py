@@ -9,7 +9,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline import logs, runtime
+from rcdsac_trl.pipeline import logs, resources, runtime
 from rcdsac_trl.pipeline.build.agent import make_average, make_loss
 from rcdsac_trl.pipeline.build.driver import Course, driver
 from rcdsac_trl.pipeline.build.read import evaluation_settings, settings_of_run, training_settings
@@ -22,6 +22,7 @@ from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSetting
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, find
 from rcdsac_trl.pipeline.settings import WorldSettings
 from rcdsac_trl.pipeline.validation import packed
+from rcdsac_trl.world.simulation import SIMULATION_BYTES
 
 
 def evaluation(cfg: DictConfig) -> EvaluationRun:
@@ -36,6 +37,10 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     conditions = [Condition()] if algo is None else algo.conditions(settings.beta, settings.collision_weight)
     world = _evaluation_world(settings, trained, len(conditions))
     device = runtime.resolve_device(settings.device)
+    processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
+    simulations = max(1, processes) * world.num_agents
+    remedy = "lower num_episodes or num_workers, or end other programs"
+    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
     name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
     if settings.run is not None:
         checkpoints = Path(settings.run) / CHECKPOINTS
@@ -66,7 +71,6 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
             trips=True,
         )
         make = partial(driver, course, weights)
-        processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
         return drive_maps(make, settings.num_maps, processes)
 
     described = {

@@ -35,6 +35,7 @@ from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, DamagedError, Progress, Saved, best_damage, folder_name, newest
 from rcdsac_trl.pipeline.trainer import Learner, Trainer
 from rcdsac_trl.pipeline.validation import Snapshot, Validation, packed
+from rcdsac_trl.world.simulation import SIMULATION_BYTES
 
 # Validation looks at the same maps whatever seed a run is trained with.
 VALIDATION_SEED = 0
@@ -66,6 +67,10 @@ def _check_memory(settings: TrainingSettings) -> None:
     observations = learner.batch_size * (learner.sequence_length + 1)
     batch_bytes = observations * sensor_mask(settings.sensor.name).size * torch.float32.itemsize
     resources.check_memory("a mini-batch", batch_bytes, f"lower learner.batch_size, {others}")
+    # Those of the training stay while a map is validated.
+    simulations = settings.world.num_agents * (1 + len(settings.algo.default_conditions))
+    needed_bytes = simulations * SIMULATION_BYTES
+    resources.check_memory(f"{simulations} simulations", needed_bytes, f"lower world.num_agents, {others}")
 
 
 def _replay_bytes(settings: TrainingSettings) -> int:
