@@ -330,7 +330,7 @@ def test_a_damaged_evaluation_folder_is_read_or_refused(few: int, run: Path, tmp
     out.mkdir()
     path = out / "evaluation.json"
     cfg = compose("evaluate", [f"run={run}", "beta=[-1]", f"out={out}"])
-    content = build.evaluation(cfg).described.encode()
+    content = build.evaluation(cfg).results.described.encode()
 
     @tries(few)
     @given(WAYS)

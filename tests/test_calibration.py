@@ -166,7 +166,7 @@ def test_a_calibration_writes_the_same_whoever_drives(run: Path, tmp_path: Path)
             run, "beta=[-2,0]", "num_maps=2", f"num_workers={workers}", f"out={tmp_path / str(workers)}"
         )
         calibration.run()
-        outs.append(calibration.out)
+        outs.append(calibration.results.path)
     for name in ("predictions.csv", "returns.csv", "calibration.json"):
         assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
     predictions, returns = pd.read_csv(outs[0] / "predictions.csv"), pd.read_csv(outs[0] / "returns.csv")

@@ -404,7 +404,7 @@ def test_a_validation_repeats_itself_and_follows_its_snapshot(tmp_path: Path) ->
 def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     built: EvaluationRun = build.evaluation(compose("evaluate", [f"run={run}", "beta=[-1]", f"out={out}"]))
-    assert built.out == out
+    assert built.results.path == out
     assert not out.exists()
 
 

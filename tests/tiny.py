@@ -75,7 +75,7 @@ def evaluate(*overrides: str) -> Path:
     given = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1", *overrides]
     evaluation = build.evaluation(compose("evaluate", given))
     evaluation.run()
-    return evaluation.out
+    return evaluation.results.path
 
 
 def evaluation_betas(row: str) -> list[float]:

@@ -20,8 +20,8 @@ def main(cfg: DictConfig) -> None:
 
     calibration = build.calibration(cfg)
     calibration.run()
-    print(write_calibration(calibration.out))
-    print(f"written to {calibration.out}")
+    print(write_calibration(calibration.results.path))
+    print(f"written to {calibration.results.path}")
 
 
 if __name__ == "__main__":

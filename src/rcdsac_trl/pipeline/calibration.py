@@ -6,7 +6,6 @@ on. What they earn is a sample of the return whose distribution the critics pred
 """
 
 import contextlib
-import json
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +22,8 @@ from rcdsac_trl.agent.actor import STATE_KEY
 from rcdsac_trl.agent.functional import call_module, squash
 from rcdsac_trl.agent.losses import OVER_CRITICS, DistributionalSACLoss
 from rcdsac_trl.pipeline.drivers import Rows
-from rcdsac_trl.pipeline.evaluation import check_out
 from rcdsac_trl.pipeline.interrupts import interruption_point
+from rcdsac_trl.pipeline.results import ResultsFolder
 
 DESCRIPTION = "calibration.json"
 """File that says what a folder's calibration is of."""
@@ -243,21 +242,21 @@ class CalibrationRun:
         num_maps: int,
         maps: Callable[[], Generator[Rows, None, None]],
     ) -> None:
-        self.out = out
-        self.described = json.dumps(described, indent=2) + "\n"
+        self.results = ResultsFolder(out, DESCRIPTION, described)
         self.num_maps = num_maps
         self.maps = maps
-        check_out(out, DESCRIPTION, self.described)
 
     def run(self) -> None:
         """Drive and write."""
         with contextlib.closing(self.maps()) as maps:
             rows = [row for rows in tqdm(maps, total=self.num_maps, unit="map", disable=None) for row in rows]
         rows.sort(key=lambda row: (row["beta"] or 0.0, row["map"], row["state"]))
-        self.out.mkdir(parents=True, exist_ok=True)
-        _predictions(rows).to_csv(self.out / "predictions.csv", index=False, float_format="%.6g")
-        _returns(rows).to_csv(self.out / "returns.csv", index=False, float_format="%.6g")
-        (self.out / DESCRIPTION).write_text(self.described)
+        self.results.write(
+            {
+                "predictions.csv": _predictions(rows).to_csv(index=False, float_format="%.6g"),
+                "returns.csv": _returns(rows).to_csv(index=False, float_format="%.6g"),
+            }
+        )
 
 
 _STATE = ("beta", "map", "state", "step")

@@ -1,8 +1,6 @@
 """Evaluation: the same maps, starts and goals for every agent, deterministic actions, one row an episode."""
 
 import contextlib
-import json
-import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,10 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.metrics import Condition, episode_metrics, summarise
-from rcdsac_trl.pipeline.resources import check_writable
+from rcdsac_trl.pipeline.results import ResultsFolder
 from rcdsac_trl.pipeline.teams import Team
 
 # What an episode's row needs; everything else of a step is dropped at once.
@@ -81,39 +77,6 @@ def table_of(maps: Iterable[Rows]) -> pd.DataFrame:
     return table.sort_values(["beta", "collision_weight", "map", "episode"], ignore_index=True)
 
 
-def _without_commit(described: str) -> dict[str, Any]:
-    """Return what was evaluated; the same by a later commit may take its place."""
-    values: dict[str, Any] = json.loads(described)
-    return {key: value for key, value in values.items() if key != "commit"}
-
-
-def _holds_another(path: Path, described: str) -> bool:
-    """Say whether a file describes another evaluation; one that cannot be read does."""
-    try:
-        return _without_commit(path.read_text()) != _without_commit(described)
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return True
-
-
-def check_out(out: Path, name: str, described: str) -> None:
-    """Refuse a folder that cannot take results, or holds those of something else.
-
-    Args:
-        out: the folder; it need not exist.
-        name: file in it that says what its results are of.
-        described: what that file would say.
-
-    Raises:
-        UserInputError: as said.
-    """
-    if os.path.exists(out) and not out.is_dir():
-        raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
-    check_writable(out)
-    path = out / name
-    if path.exists() and _holds_another(path, described):
-        raise UserInputError(f"{out} holds the {path.stem} of something else: give another folder with out=<folder>")
-
-
 class EvaluationRun:
     """An evaluation and the folder it writes: ``episodes.csv``, ``summary.csv`` and ``evaluation.json``.
 
@@ -135,11 +98,9 @@ class EvaluationRun:
         num_maps: int,
         maps: Callable[[], Generator[Rows, None, None]],
     ) -> None:
-        self.out = out
-        self.described = json.dumps(described, indent=2) + "\n"
+        self.results = ResultsFolder(out, "evaluation.json", described)
         self.num_maps = num_maps
         self.maps = maps
-        check_out(out, "evaluation.json", self.described)
 
     def run(self) -> None:
         """Drive, print the summary, and write.
@@ -153,10 +114,10 @@ class EvaluationRun:
         summary = summarise(episodes, ["beta", "collision_weight"])
         shown = summary.dropna(axis="columns", how="all").set_index("episodes")
         print(shown.T.to_string(header=True, float_format="%.3f"))
-        check_out(self.out, "evaluation.json", self.described)
-        self.out.mkdir(parents=True, exist_ok=True)
-        durable.write(self.out / "episodes.csv", episodes.to_csv(index=False, float_format="%.9g").encode())
-        durable.write(self.out / "summary.csv", summary.to_csv(index=False, float_format="%.6g").encode())
-        # Last: a folder that has this one has them all.
-        durable.write(self.out / "evaluation.json", self.described.encode())
-        print(f"written to {self.out}")
+        self.results.write(
+            {
+                "episodes.csv": episodes.to_csv(index=False, float_format="%.9g"),
+                "summary.csv": summary.to_csv(index=False, float_format="%.6g"),
+            }
+        )
+        print(f"written to {self.results.path}")
