@@ -14,7 +14,7 @@ from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.pipeline.build import training
 from rcdsac_trl.pipeline.build.read import training_settings
 from rcdsac_trl.pipeline.cli import compose
-from rcdsac_trl.pipeline.trainer import Learner
+from rcdsac_trl.pipeline.learner import Learner
 from rcdsac_trl.seeding import torch_stream
 
 EPISODES = 20

@@ -21,7 +21,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.agent.losses import DistributionalSACLoss
 from rcdsac_trl.agent.networks import LOG_STD_RANGE, Encoder, QuantileHead
 from rcdsac_trl.agent.risk import RiskMeasure
-from rcdsac_trl.pipeline.trainer import Learner
+from rcdsac_trl.pipeline.learner import Learner
 
 
 class Features(nn.Module):

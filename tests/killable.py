@@ -18,9 +18,9 @@ from typing import Any
 import torch
 
 from rcdsac_trl.pipeline import build, drivers
+from rcdsac_trl.pipeline.learner import Learner
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.replay import SequenceReplay
-from rcdsac_trl.pipeline.trainer import Learner
 from rcdsac_trl.world.agents import AgentGroup
 from tiny import evaluate, tiny_trainer
 

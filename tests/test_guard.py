@@ -13,8 +13,9 @@ from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline import build
 from rcdsac_trl.pipeline.build.agent import make_loss
 from rcdsac_trl.pipeline.guard import load_failure
+from rcdsac_trl.pipeline.learner import Learner
 from rcdsac_trl.pipeline.saved import load_progress
-from rcdsac_trl.pipeline.trainer import Learner, Trainer
+from rcdsac_trl.pipeline.trainer import Trainer
 from tiny import ITERATIONS, TINY, tiny_settings, tiny_trainer
 
 

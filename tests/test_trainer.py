@@ -20,11 +20,12 @@ from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.pipeline.build.agent import make_loss
 from rcdsac_trl.pipeline.checkpoint import load_weights
 from rcdsac_trl.pipeline.collection import CollectorEpisodes
+from rcdsac_trl.pipeline.learner import LOSS_KEYS, Learner
 from rcdsac_trl.pipeline.logs import RunLog
 from rcdsac_trl.pipeline.metrics import METRICS
 from rcdsac_trl.pipeline.saved import Progress, load_progress
 from rcdsac_trl.pipeline.settings import Schedule
-from rcdsac_trl.pipeline.trainer import LOSS_KEYS, Learner, Trainer
+from rcdsac_trl.pipeline.trainer import Trainer
 from rcdsac_trl.pipeline.validation import Snapshot
 from rcdsac_trl.world import episode
 from rcdsac_trl.world.env import NavigationEnv, make_env

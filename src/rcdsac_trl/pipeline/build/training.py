@@ -29,11 +29,12 @@ from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators, load_average
 from rcdsac_trl.pipeline.drivers import resolve_processes_beside
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.guard import FiniteGuard, load_failure
+from rcdsac_trl.pipeline.learner import Learner
 from rcdsac_trl.pipeline.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.pipeline.replay_files import ReplayFiles
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, DamagedError, Progress, Saved, best_damage, folder_name, newest
-from rcdsac_trl.pipeline.trainer import Learner, Trainer
+from rcdsac_trl.pipeline.trainer import Trainer
 from rcdsac_trl.pipeline.validation import Snapshot, Validation, packed
 from rcdsac_trl.world.simulation import SIMULATION_BYTES
 
