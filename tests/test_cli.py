@@ -142,6 +142,18 @@ def refusal(
             [POW, "collector=single", "+collector.num_processes=2"],
             "collector.num_processes=2 does nothing with collector=single: give world.num_workers",
         ),
+        (
+            [POW, "+collector.address=auto"],
+            "collector.address=auto does nothing with collector=multi: take",
+        ),
+        (
+            [POW, "collector=ray", "collector.num_processes=0"],
+            "collector.num_processes=0 leaves Ray nothing to do:",
+        ),
+        (
+            [POW, "collector=ray", "collector.num_processes=3"],
+            "collector.num_processes=3 cannot share world.num_agents=10 evenly: give a divisor",
+        ),
         ([POW, "collector.num_processes=-1"], "collector.num_processes=-1 is not a number of processes"),
         ([POW, "world.num_agents=0"], "world.num_agents=0 is below 1"),
         ([POW, "task.episode_steps=5", "learner.sequence_length=6"], "learner.sequence_length=6 is longer than an epi"),
@@ -358,8 +370,9 @@ def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -
         ["collector=single", "world.num_workers=2"],
         ["collector.num_processes=2"],
         ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"],
+        ["collector=ray", "collector.num_processes=2"],
     ],
-    ids=["workers", "teams", "validation"],
+    ids=["workers", "teams", "validation", "ray"],
 )
 def test_ctrl_c_with_processes(tmp_path: Path, processes: list[str]) -> None:
     code, err = interrupt(tmp_path, *processes)

@@ -24,7 +24,6 @@ from rcdsac_trl.pipeline import build, resources
 from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress, newest
 from rcdsac_trl.pipeline.team_processes import Request, TeamProcesses
-from rcdsac_trl.pipeline.teams import Driven
 from rcdsac_trl.world.agents import AgentGroup
 from rcdsac_trl.world.env import make_env
 from rcdsac_trl.world.maps import MapSettings
@@ -88,7 +87,7 @@ def test_a_run_goes_on_after_a_team_was_killed(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("rcdsac_trl.pipeline.team_processes.START_METHOD", "fork")  # starts at once
     ask, asked = TeamProcesses.ask, [0]
 
-    def killing(self: TeamProcesses, request: Request) -> list[Driven]:
+    def killing(self: TeamProcesses, request: Request) -> TensorDictBase:
         asked[0] += 1
         if asked[0] == 2:
             os.kill(self._processes[1].pid, signal.SIGKILL)

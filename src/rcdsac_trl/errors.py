@@ -6,6 +6,11 @@ def _on_one_line(sentence: str) -> str:
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode("ascii") for char in sentence)
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an engine says of an error, or the error's name if it says nothing."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
 class UserInputError(ValueError):
     """Wrong input from a user.
 

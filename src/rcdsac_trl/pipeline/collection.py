@@ -8,7 +8,6 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from rcdsac_trl.pipeline.team_processes import Request, Teams
-from rcdsac_trl.pipeline.teams import side_by_side
 from rcdsac_trl.world.workers import WorkerError
 
 
@@ -48,11 +47,10 @@ class TeamEpisodes:
         try:
             if self._teams is None:
                 self._teams = self._make()
-            parts = self._teams.ask(Request(iteration, map_index, self._weights()))
+            return self._teams.ask(Request(iteration, map_index, self._weights()))
         except WorkerError:
             self.close()
             raise
-        return side_by_side(parts).tensordict()
 
     def close(self) -> None:
         """See :class:`Episodes`."""

@@ -5,7 +5,6 @@ job is a process of its own that is told its share of the cores.
 """
 
 import importlib
-import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,19 +12,12 @@ from types import ModuleType
 from typing import Any, Literal
 
 from rcdsac_trl.cores import usable_cores
-from rcdsac_trl.errors import FaultError, UserInputError
+from rcdsac_trl.errors import FaultError, UserInputError, first_line
+from rcdsac_trl.pipeline.extras import needs
 from rcdsac_trl.pipeline.sweep import Job, Launcher, State, execute
 from rcdsac_trl.pipeline.typed import read
 
 Ended = Iterator[tuple[Job, State]]
-
-
-def _needs(package: str, launcher: str) -> None:
-    if importlib.util.find_spec(package) is None:
-        raise UserInputError(
-            f"launcher={launcher} needs {package}, which is not installed: pip install 'rcdsac-trl[{launcher}]', or "
-            "use launcher=local"
-        )
 
 
 def _engine(package: str) -> ModuleType:
@@ -40,11 +32,7 @@ def _check_least(settings: object, lowest: int, *keys: str) -> None:
 
 def _fault(error: BaseException) -> State:
     """Say that an engine lost a job: its machine went down, it was cancelled or refused."""
-    return State("failed", f"{type(error).__name__}: {_first_line(error)}")
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return State("failed", f"{type(error).__name__}: {first_line(error)}")
 
 
 @dataclass(frozen=True)
@@ -72,7 +60,7 @@ class JoblibLauncher:
         _check_least(self, 1, "cores_per_run")
         if self.runs_at_once != "auto":
             _check_least(self, 1, "runs_at_once")
-        _needs("joblib", self.name)
+        needs("joblib", f"launcher={self.name}", extra=self.name, instead="launcher=local")
 
     def run(self, jobs: Sequence[Job]) -> Ended:
         """Run every job, see :class:`~rcdsac_trl.pipeline.sweep.Launcher`."""
@@ -111,7 +99,7 @@ class SlurmLauncher:
         for option in self.sbatch:
             if not option.partition("=")[2]:
                 raise UserInputError(f"launcher.sbatch={option} is no option of sbatch: write it as <name>=<value>")
-        _needs("submitit", self.name)
+        needs("submitit", f"launcher={self.name}", extra=self.name, instead="launcher=local")
 
     def run(self, jobs: Sequence[Job]) -> Ended:
         """Run every job, see :class:`~rcdsac_trl.pipeline.sweep.Launcher`."""
@@ -135,7 +123,7 @@ class SlurmLauncher:
             )
             submitted = executor.map_array(Requeued(self.cores_per_run), list(jobs))
         except Exception as error:  # whatever submitit and SLURM find to say
-            raise FaultError(f"launcher=slurm: {_first_line(error)}") from error
+            raise FaultError(f"launcher=slurm: {first_line(error)}") from error
         of = dict(zip(submitted, jobs, strict=True))
         print(f"submitted {len(jobs)} jobs to {self.cluster}; their logs: {logs.parent}", flush=True)
         for ended in submitit.helpers.as_completed(submitted, poll_frequency=2):
@@ -175,7 +163,7 @@ class RayLauncher:
         """Refuse what is below its limit, and a missing package."""
         _check_least(self, 1, "cores_per_run")
         _check_least(self, 0, "gpus_per_run")
-        _needs("ray", self.name)
+        needs("ray", f"launcher={self.name}", extra=self.name, instead="launcher=local")
 
     def run(self, jobs: Sequence[Job]) -> Ended:
         """Run every job, see :class:`~rcdsac_trl.pipeline.sweep.Launcher`."""
@@ -184,7 +172,7 @@ class RayLauncher:
         try:
             ray.init(address=self.address or "local", log_to_driver=False, **own)
         except Exception as error:
-            raise FaultError(f"launcher.address={self.address}: {_first_line(error)}") from error
+            raise FaultError(f"launcher.address={self.address}: {first_line(error)}") from error
         try:
             task = ray.remote(num_cpus=self.cores_per_run, num_gpus=self.gpus_per_run)(execute)
             waiting = {task.remote(job, self.cores_per_run): job for job in jobs}

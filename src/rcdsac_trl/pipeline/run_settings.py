@@ -11,6 +11,7 @@ from typing import Literal
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.pipeline.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.pipeline.drivers import resolve_processes
 from rcdsac_trl.pipeline.settings import AlgoSettings, LearnerSettings, Schedule, WorldSettings
 from rcdsac_trl.world.maps import MapSettings
@@ -51,23 +52,6 @@ class TeamSettings:
     def __post_init__(self) -> None:
         """Refuse what is below 0."""
         _check_least("world.max_restarts", self.max_restarts, 0)
-
-
-@dataclass(frozen=True)
-class CollectorSettings:
-    """What collects the episodes (``conf/collector``)."""
-
-    name: Literal["multi", "single"]
-    num_processes: Workers = 0
-
-    def __post_init__(self) -> None:
-        """Refuse processes that there cannot be."""
-        resolve_processes(self.num_processes, 1, "collector.num_processes")
-        if self.name == "single" and self.num_processes != 0:
-            raise UserInputError(
-                f"collector.num_processes={self.num_processes} does nothing with collector=single: give "
-                "world.num_workers, or take collector=multi"
-            )
 
 
 @dataclass(frozen=True)
@@ -127,15 +111,16 @@ class TrainingSettings:
     validation: ValidationSettings
     checkpoint: CheckpointSettings
     # Runs of earlier versions name none: this is what they had.
-    collector: CollectorSettings = CollectorSettings("single")
+    collector: CollectorSettings = SINGLE
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together, or not this machine."""
         _check_least("seed", self.seed, 0)
         runtime.resolve_threads(self.threads)
-        if self.collector.name == "multi" and self.world.num_workers != 0:
+        self.collector.check_agents(self.world.num_agents)
+        if self.collector.name != "single" and self.world.num_workers != 0:
             raise UserInputError(
-                f"world.num_workers={self.world.num_workers} does nothing with collector=multi: give "
+                f"world.num_workers={self.world.num_workers} does nothing with collector={self.collector.name}: give "
                 "collector.num_processes, or take collector=single"
             )
         if self.schedule.distortion_strength(0) < 1:

@@ -15,9 +15,10 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, Protocol, cast
 
 import torch
+from tensordict import TensorDictBase
 
 from rcdsac_trl.pipeline.interrupts import interruption_point
-from rcdsac_trl.pipeline.teams import Driven
+from rcdsac_trl.pipeline.teams import Driven, side_by_side
 from rcdsac_trl.world.workers import START_METHOD, WorkerError, ending
 
 _PRELOADED = "rcdsac_trl.pipeline.build"
@@ -41,8 +42,8 @@ MakeDrive = Callable[[], AbstractContextManager[Drive]]
 class Teams(Protocol):
     """Teams that together hold all agents."""
 
-    def ask(self, request: Request) -> list[Driven]:
-        """Return the episodes of each team, in their order."""
+    def ask(self, request: Request) -> TensorDictBase:
+        """Return the episodes of all agents, ``[N, T]``, team after team."""
 
     def close(self) -> None:
         """End the teams."""
@@ -59,9 +60,9 @@ class LocalTeam:
         self._stack = contextlib.ExitStack()
         self._drive = self._stack.enter_context(make())
 
-    def ask(self, request: Request) -> list[Driven]:
+    def ask(self, request: Request) -> TensorDictBase:
         """See :class:`Teams`."""
-        return [self._drive(request, interruption_point)]
+        return self._drive(request, interruption_point).tensordict()
 
     def close(self) -> None:
         """See :class:`Teams`."""
@@ -99,7 +100,7 @@ class TeamProcesses:
             self.close()
             raise
 
-    def ask(self, request: Request) -> list[Driven]:
+    def ask(self, request: Request) -> TensorDictBase:
         """See :class:`Teams`.
 
         Raises:
@@ -124,7 +125,7 @@ class TeamProcesses:
                 if self._timeout_s is not None and time.monotonic() - heard_s[number] > self._timeout_s:
                     self._hung.add(number)
                     raise self._error(number)
-        return [answers[number] for number in range(len(self._connections))]
+        return side_by_side([answers[number] for number in range(len(self._connections))]).tensordict()
 
     @contextlib.contextmanager
     def _reporting(self, number: int) -> Iterator[None]:

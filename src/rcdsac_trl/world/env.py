@@ -192,11 +192,20 @@ def _torch_spec(space: Space, batch: torch.Size) -> TensorSpec:
     return Bounded(low, high, shape=shape, dtype=torch.float32)
 
 
+def largest_divisor(number: int, limit: int) -> int:
+    """Return the largest divisor of a number that is not above a limit; 1 if the limit is below it.
+
+    Example:
+        >>> largest_divisor(10, 8)
+        5
+    """
+    return max(n for n in range(1, number + 1) if number % n == 0 and n <= max(limit, 1))
+
+
 def resolve_num_workers(num_workers: int | Literal["auto"], num_agents: int) -> int:
     """Return the number of worker processes; see :func:`make_env`."""
     if num_workers == "auto":
-        cores = usable_cores()
-        return max(n for n in range(1, num_agents + 1) if num_agents % n == 0 and n <= cores)
+        return largest_divisor(num_agents, usable_cores())
     if not isinstance(num_workers, int) or num_workers < 0 or (num_workers and num_agents % num_workers):
         raise UserInputError(
             f"num_workers={num_workers!r} cannot share {num_agents} agents evenly: "

@@ -3,26 +3,32 @@
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import safetensors.torch
 import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from rcdsac_trl.cores import usable_cores
 from rcdsac_trl.pipeline.build.agent import make_actor, make_policy
 from rcdsac_trl.pipeline.build.world import environment, team
 from rcdsac_trl.pipeline.collection import CollectorEpisodes, Episodes, TeamEpisodes
 from rcdsac_trl.pipeline.drivers import resolve_processes
+from rcdsac_trl.pipeline.extras import needs
 from rcdsac_trl.pipeline.policies import AgentNoise, CollectionPolicy
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.saved import Progress
-from rcdsac_trl.pipeline.team_processes import Drive, LocalTeam, Request, TeamProcesses, Teams
+from rcdsac_trl.pipeline.team_processes import Drive, LocalTeam, MakeDrive, Request, TeamProcesses, Teams
 from rcdsac_trl.pipeline.teams import Driven
 from rcdsac_trl.pipeline.validation import packed
+from rcdsac_trl.world.env import largest_divisor
 from rcdsac_trl.world.maps import Split
-from rcdsac_trl.world.spaces import AGENT_OBSERVATIONS
+from rcdsac_trl.world.spaces import ACTION_SIZE, AGENT_OBSERVATIONS, SPACES
 
 SPLIT: Split = "train"
 # What the replay and the metrics read of a step, beside the observations.
@@ -41,20 +47,91 @@ def make_episodes(settings: TrainingSettings, actor: TensorDictSequential, devic
     return _COLLECTORS[settings.collector.name](settings, actor, device, progress)
 
 
+def check_collector(settings: TrainingSettings) -> None:
+    """Refuse a collector whose package is missing.
+
+    Raises:
+        UserInputError: if it is.
+    """
+    if settings.collector.name == "ray":
+        needs("ray", "collector=ray", extra="ray", instead="collector=multi")
+    if settings.collector.slurm is not None:
+        needs("submitit", "collector.slurm", extra="slurm", instead="collector.slurm=null")
+
+
 def _multi(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
     """Share the agents out over processes; they drive on the CPU, wherever the learner is."""
     given = settings.world
     processes = resolve_processes(settings.collector.num_processes, given.num_agents, "collector.num_processes")
-    shares = [part.tolist() for part in np.array_split(np.arange(given.num_agents), max(processes, 1))]
-    makes = [partial(_team, settings, agent_ids) for agent_ids in shares]
-    described = [f"split {SPLIT}, seed {settings.seed}, agents {', '.join(map(str, ids))}" for ids in shares]
 
     def teams() -> Teams:
         if processes == 0:
-            return LocalTeam(makes[0])
-        return TeamProcesses(makes, described, given.worker_timeout_s)
+            return LocalTeam(partial(_team, settings, range(given.num_agents)))
+        shares = _shares(settings, processes)
+        return TeamProcesses(list(shares.values()), list(shares), given.worker_timeout_s)
 
     return TeamEpisodes(teams, lambda: packed(actor))
+
+
+def _ray(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
+    """Share the agents out over processes of a Ray cluster; they drive on the CPU, wherever the learner is."""
+    from rcdsac_trl.pipeline.ray_teams import RayTeams  # imports Ray, which takes long and may not be there
+
+    given, number = settings.world, settings.collector.num_processes
+    cores = usable_cores() if number == "auto" else max(number, usable_cores())
+
+    def shares(cores_of_cluster: int) -> dict[str, MakeDrive]:
+        return _shares(settings, largest_divisor(given.num_agents, cores_of_cluster) if number == "auto" else number)
+
+    def teams() -> Teams:
+        return RayTeams(shares, address=settings.collector.address, cores=cores, timeout_s=given.worker_timeout_s)
+
+    return TeamEpisodes(teams, lambda: packed(actor))
+
+
+def _distributed(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
+    """Share the agents out over processes of a group; they drive on the CPU, wherever the learner is."""
+    from rcdsac_trl.pipeline.distributed_teams import DistributedTeams
+
+    given, slurm = settings.world, settings.collector.slurm
+    number = settings.collector.num_processes
+    processes = largest_divisor(given.num_agents, usable_cores()) if number == "auto" else number
+    options: dict[str, Any] = {"slurm_cpus_per_task": 1, "slurm_gpus_per_node": 0}
+    if slurm is not None:
+        options |= {"timeout_min": slurm.timeout_min, "slurm_partition": slurm.partition}
+
+    def teams() -> Teams:
+        return DistributedTeams(
+            _shares(settings, processes),
+            _example(settings, given.num_agents // processes),
+            slurm=None if slurm is None else options,
+            timeout_s=given.worker_timeout_s,
+        )
+
+    return TeamEpisodes(teams, lambda: packed(actor))
+
+
+def _example(settings: TrainingSettings, num_agents: int) -> TensorDict:
+    """Return what a team of some agents returns, with zeros for all numbers."""
+
+    def zeros(key: str, times: int) -> NDArray:
+        return np.zeros((num_agents, times, SPACES[key].size), SPACES[key].dtype)
+
+    steps, told = settings.task.episode_steps, settings.algo.context_key
+    observed = {key: zeros(key, steps + 1) for key in AGENT_OBSERVATIONS}
+    done = {key: zeros(key, steps) for key in _HAPPENED}
+    done["action"] = np.zeros((num_agents, steps, ACTION_SIZE), np.float32)
+    whole = {} if told is None else {told: np.zeros((num_agents, 1), np.float32)}
+    return Driven(observed, done, whole).tensordict().contiguous()
+
+
+def _shares(settings: TrainingSettings, processes: int) -> dict[str, MakeDrive]:
+    """Share the agents out; return what makes each team, by what describes it."""
+    parts = [part.tolist() for part in np.array_split(np.arange(settings.world.num_agents), processes)]
+    return {
+        f"split {SPLIT}, seed {settings.seed}, agents {', '.join(map(str, ids))}": partial(_team, settings, ids)
+        for ids in parts
+    }
 
 
 @contextlib.contextmanager
@@ -133,4 +210,4 @@ def _collection_policy(
     )
 
 
-_COLLECTORS = {"multi": _multi, "single": _single}
+_COLLECTORS = {"multi": _multi, "single": _single, "ray": _ray, "distributed": _distributed}

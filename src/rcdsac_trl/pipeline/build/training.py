@@ -22,7 +22,7 @@ from rcdsac_trl.pipeline.build.agent import (
     make_relabel,
     parameters,
 )
-from rcdsac_trl.pipeline.build.collection import make_episodes
+from rcdsac_trl.pipeline.build.collection import check_collector, make_episodes
 from rcdsac_trl.pipeline.build.driver import Course, driver
 from rcdsac_trl.pipeline.build.read import settings_of_run, training_settings
 from rcdsac_trl.pipeline.checkpoint import Checkpoints, Generators, load_average, rotate
@@ -58,6 +58,7 @@ def check_training(cfg: DictConfig) -> None:
     settings = training_settings(cfg)
     runtime.resolve_device(settings.device)
     logs.check_backends(settings.logger.backends)
+    check_collector(settings)
     _check_memory(settings)
 
 
@@ -149,6 +150,7 @@ def resumed(folder: Path) -> Trainer | None:
     """
     settings = settings_of_run(folder, key="resume")
     resources.check_writable(folder)
+    check_collector(settings)
     _check_memory(settings)
     lock = FolderLock(folder)
     try:
