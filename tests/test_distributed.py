@@ -13,6 +13,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
+from killed_training import check_killed_run_is_continued
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import build, extras
 from rcdsac_trl.pipeline.build.agent import make_actor
@@ -104,6 +105,11 @@ def test_a_run_goes_on_after_a_process_was_lost(
     progress = newest(run / CHECKPOINTS, replay=run / "replay")[0].progress
     assert (progress.iterations, progress.restarts, progress.skipped_maps) == (3, 1, 1)
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_a_killed_run_leaves_no_process_and_is_continued(tmp_path: Path) -> None:
+    check_killed_run_is_continued(tmp_path, *GROUP)
 
 
 @pytest.mark.slow

@@ -5,9 +5,6 @@ Ray takes long to start, and each of its processes to import: what needs a clust
 
 import os
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -17,16 +14,17 @@ import pandas as pd
 import pytest
 import torch
 
+from killed_training import check_killed_run_is_continued
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.pipeline import build, extras
 from rcdsac_trl.pipeline.build.agent import make_actor
 from rcdsac_trl.pipeline.build.collection import _team
-from rcdsac_trl.pipeline.saved import CHECKPOINTS, folder_name, newest
+from rcdsac_trl.pipeline.saved import CHECKPOINTS, newest
 from rcdsac_trl.pipeline.team_collector import STEPS, TeamCollector
 from rcdsac_trl.pipeline.team_processes import LocalTeam, Request
 from rcdsac_trl.pipeline.validation import packed
 from test_teams import collected
-from tiny import AGENTS, TINY, tiny_cfg, tiny_settings, tiny_trainer
+from tiny import AGENTS, tiny_cfg, tiny_settings, tiny_trainer
 from tiny import STEPS as EPISODE_STEPS
 
 RAY = ("collector=ray", "collector.num_processes=2")
@@ -141,42 +139,9 @@ def test_a_cluster_without_room_is_told(ray: Any) -> None:
         RayTeams(lambda cores: makes, address=None, cores=1, timeout_s=1.0)
 
 
-def descendants(pid: int) -> set[int]:
-    found = {int(child) for task in Path(f"/proc/{pid}/task").glob("*/children") for child in task.read_text().split()}
-    return found.union(*(descendants(child) for child in found))
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 @pytest.mark.slow
 def test_a_killed_run_leaves_no_process_and_is_continued(ray: Any, tmp_path: Path) -> None:
-    run, other = tmp_path / "run", tmp_path / "other"
-    given = ["schedule.iterations=4", "task.episode_steps=200"]
-    overrides = ["+algo=rcdsac_pow", *TINY, *RAY, *given, f"hydra.run.dir={run}"]
-    # A process of its own, which makes a cluster of its own.
-    training = subprocess.Popen([sys.executable, "-m", "rcdsac_trl.train", *overrides], stdout=subprocess.DEVNULL)
-    while training.poll() is None and not (run / CHECKPOINTS / folder_name(1)).exists():
-        time.sleep(0.05)
-    started = descendants(training.pid)
-    assert training.poll() is None
-    training.kill()
-    training.wait()
-    assert len(started) > 2
-    deadline = time.monotonic() + 120
-    while any(map(is_alive, started)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not any(map(is_alive, started))
-    resumed = build.resumed(run)
-    assert resumed is not None
-    assert resumed.progress.iterations >= 1
-    resumed.run()
-    tiny_trainer(other, "rcdsac_pow", *given).run()
-    assert (run / "training_episodes.csv").read_bytes() == (other / "training_episodes.csv").read_bytes()
+    check_killed_run_is_continued(tmp_path, *RAY)  # which made a cluster of its own
 
 
 @pytest.mark.slow

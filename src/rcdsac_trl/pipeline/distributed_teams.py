@@ -4,6 +4,7 @@ Import this module only where it is wanted: it takes a second.
 """
 
 import contextlib
+import multiprocessing
 import multiprocessing.connection
 import signal
 import socket
@@ -51,8 +52,9 @@ class StoreTeamCollector(TeamCollector):
     def __init__(
         self, create_env_fn: Sequence[MakeDrive], *, store: tuple[str, int], worker: int, **settings: Any
     ) -> None:
-        # A terminal sends Ctrl-C to all processes; the main one ends the others.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if multiprocessing.parent_process() is not None:
+            # A terminal sends Ctrl-C to all processes; the main one ends the others.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         super().__init__(create_env_fn, worker_idx=worker)
         self._worker = worker
         self._store = TCPStore(*store, is_master=False, timeout=_FOR_EVER)
