@@ -5,7 +5,8 @@ Ray takes long to start, and each of its processes to import: what needs a clust
 
 import os
 import signal
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch
+from tensordict import TensorDictBase
 
 from killed_training import check_killed_run_is_continued
 from rcdsac_trl.errors import FaultError, UserInputError
@@ -20,7 +22,7 @@ from rcdsac_trl.pipeline import build, extras
 from rcdsac_trl.pipeline.build.agent import make_actor
 from rcdsac_trl.pipeline.build.collection import _team
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, newest
-from rcdsac_trl.pipeline.team_collector import STEPS, TeamCollector
+from rcdsac_trl.pipeline.team_collector import AT_REST, STEPS, TeamCollector, beside, watch
 from rcdsac_trl.pipeline.team_processes import LocalTeam, Request
 from rcdsac_trl.pipeline.validation import packed
 from test_teams import collected
@@ -39,17 +41,33 @@ def test_a_team_as_a_collector_drives_what_it_is_asked_for() -> None:
     make = partial(_team, settings, [0, 1])
     requests = [Request(number, 3 - number, packed(make_actor(settings))) for number in range(2)]
     team, collector = LocalTeam(make), TeamCollector([make], worker_idx=1, frames_per_batch=7)
-    assert collector.stats() == {STEPS: 0}
+    assert collector.stats() == {STEPS: AT_REST}
     for request in requests:
         collector.prepare(request)
+        assert collector.stats() == {STEPS: request.iteration * EPISODE_STEPS}
         found, expected = collector.next(), team.ask(request)
         assert found.batch_size == (AGENTS, EPISODE_STEPS)
         for key in expected.keys(True, True):
             assert torch.equal(found[key], expected[key]), key
-    assert collector.stats() == {STEPS: 2 * EPISODE_STEPS}
+        assert collector.stats() == {STEPS: AT_REST}
     with pytest.raises(RuntimeError, match=r"^prepare\(\) says what to drive"):
         collector.next()
     team.close()
+
+
+def test_a_process_at_rest_does_not_count_as_hung_but_one_that_neither_steps_nor_answers_does() -> None:
+    steps = iter(range(1000))
+
+    def told(third: dict[int, float]) -> Callable[[], dict[int, float]]:
+        return lambda: {0: AT_REST, 1: float(next(steps)), **third}
+
+    done = threading.Event()
+    waiting = beside(done.wait)
+    assert watch(waiting, told({2: 5.0}), 3, timeout_s=0.5) == 2
+    assert watch(waiting, told({}), 3, timeout_s=0.5) == 2
+    threading.Timer(1.5, done.set).start()
+    assert watch(waiting, told({2: AT_REST}), 3, timeout_s=0.5) is None
+    assert watch(beside(lambda: 1 / 0), told({}), 3, timeout_s=None) is None
 
 
 def test_without_ray_the_line_that_installs_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,18 +81,21 @@ def test_without_ray_the_line_that_installs_it_is_told(monkeypatch: pytest.Monke
 
 # ------------------------------------------------------------------------------------------------ on a cluster
 @pytest.fixture(scope="module")
-def ray() -> Iterator[Any]:
-    """A cluster of this machine with two cores, whatever it has; everything connects to it."""
+def cluster() -> Iterator[Any]:
+    """Two nodes with a core each, which share this machine; everything connects to them."""
     ray = pytest.importorskip("ray")
-    before = os.environ.get("PYTHONPATH")
+    from ray.cluster_utils import Cluster
+
     source = Path(__file__).parents[1] / "src"
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(source), before or ""])
-    ray.init(address="local", num_cpus=2, include_dashboard=False, log_to_driver=False)
-    yield ray
-    ray.shutdown()
-    os.environ.pop("PYTHONPATH")
-    if before is not None:
-        os.environ["PYTHONPATH"] = before
+    with pytest.MonkeyPatch.context() as given:
+        given.setenv("PYTHONPATH", os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")]))
+        given.setenv("RAY_worker_niceness", "0")  # else, beside other programs, its processes hardly start
+        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+        cluster.add_node(num_cpus=1)
+        ray.init(address=cluster.address, log_to_driver=False)
+        yield cluster
+        ray.shutdown()
+        cluster.shutdown()
 
 
 def training_rows(run: Path) -> pd.DataFrame:
@@ -82,7 +103,7 @@ def training_rows(run: Path) -> pd.DataFrame:
 
 
 @pytest.mark.slow
-def test_episodes_do_not_depend_on_what_collects_them(ray: Any) -> None:
+def test_episodes_do_not_depend_on_what_collects_them(cluster: Any) -> None:
     given = ("world.num_agents=4", "schedule.pursuit_iterations=1")
     for one, other in zip(collected("rcwr", *RAY, *given), collected("rcwr", *given), strict=True):
         assert one.batch_size == other.batch_size == (4, 20)
@@ -91,34 +112,58 @@ def test_episodes_do_not_depend_on_what_collects_them(ray: Any) -> None:
             assert torch.equal(one[key], other[key]), key
 
 
+def kill(cluster: Any, collectors: Sequence[Any], number: signal.Signals) -> int:
+    """Send the second process a signal; return which one that is."""
+    import ray
+
+    os.kill(ray.get(collectors[1].__ray_call__.remote(lambda collector: os.getpid())), number)
+    return 1
+
+
+def remove_a_node(cluster: Any, collectors: Sequence[Any]) -> int:
+    """Remove the node that is not the head, while another is there; return which process it held."""
+    import ray
+
+    ask = [each.__ray_call__.remote(lambda _: ray.get_runtime_context().get_node_id()) for each in collectors]
+    (node,) = cluster.worker_nodes
+    held = ray.get(ask).index(node.node_id)
+    cluster.add_node(num_cpus=1)
+    cluster.remove_node(node)
+    return held
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("number", "told"),
+    ("lose", "told"),
     [
-        (signal.SIGKILL, "failed: The actor died unexpectedly before finishing this task.; restart 1 of at most 5"),
-        (signal.SIGSTOP, "gave no answer within 5 s; restart 1 of at most 5"),
+        (partial(kill, number=signal.SIGKILL), "failed: The actor died unexpectedly before finishing this task."),
+        (partial(kill, number=signal.SIGSTOP), "gave no answer within 5 s"),
+        (remove_a_node, "failed: The actor died"),
     ],
+    ids=["killed", "stopped", "node"],
 )
 def test_a_run_goes_on_after_a_process_was_lost(
-    ray: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, told: str
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lose: Callable[..., int], told: str
 ) -> None:
     from rcdsac_trl.pipeline.ray_teams import RayTeams
 
-    ask, asked = RayTeams.ask, []
+    ask, asked, lost = RayTeams.ask, [], []
 
-    def losing(self: RayTeams, request: Request) -> Any:
+    def losing(self: RayTeams, request: Request) -> TensorDictBase:
         asked.append(request)
         if len(asked) == 2:
-            second = self._collector.remote_collectors[1]
-            os.kill(ray.get(second.__ray_call__.remote(lambda collector: os.getpid())), number)
-            self._timeout_s = 5.0  # they have started
+            lost.append(lose(cluster, self._collector.remote_collectors))
+            self._timeout_s = 5.0 if "5 s" in told else None  # they have started
         return ask(self, request)
 
     monkeypatch.setattr(RayTeams, "ask", losing)
     run, other = tmp_path / "run", tmp_path / "other"
     tiny_trainer(run, "rcdsac_pow", *RAY, "schedule.iterations=3", "world.worker_timeout_s=600").run()
     log = (run / "train.log").read_text()
-    assert f"iteration 1, training map 1: Ray process 2 of 2 (split train, seed 0, agents 1) {told}\n" in log
+    (agent,) = lost  # each process holds the agent of its number
+    name = f"Ray process {agent + 1} of 2 (split train, seed 0, agents {agent})"
+    assert f"iteration 1, training map 1: {name} {told}" in log
+    assert "; restart 1 of at most 5\nthe episodes on map 1 are dropped" in log
     assert [(each.iteration, each.map_index) for each in asked] == [(0, 0), (1, 1), (1, 2), (2, 3)]
     # What agents are told follows from agent and map: every agent's episodes are there, once.
     tiny_trainer(other, "rcdsac_pow", "schedule.iterations=4").run()
@@ -130,7 +175,7 @@ def test_a_run_goes_on_after_a_process_was_lost(
 
 
 @pytest.mark.slow
-def test_a_cluster_without_room_is_told(ray: Any) -> None:
+def test_a_cluster_without_room_is_told(cluster: Any) -> None:
     from rcdsac_trl.pipeline.ray_teams import RayTeams
     from rcdsac_trl.world.workers import WorkerError
 
@@ -140,7 +185,7 @@ def test_a_cluster_without_room_is_told(ray: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_run_leaves_no_process_and_is_continued(ray: Any, tmp_path: Path) -> None:
+def test_a_killed_run_leaves_no_process_and_is_continued(cluster: Any, tmp_path: Path) -> None:
     check_killed_run_is_continued(tmp_path, *RAY)  # which made a cluster of its own
 
 

@@ -66,7 +66,10 @@ class StoreTeamCollector(TeamCollector):
         batches = super().iterator()
         for number in count():
             self.prepare(_unpacked(self._store.get(_request_key(number))))
-            yield next(batches).contiguous()
+            self._tell()
+            driven = next(batches).contiguous()
+            self._tell()
+            yield driven
 
     def _count(self) -> None:
         super()._count()
@@ -74,7 +77,7 @@ class StoreTeamCollector(TeamCollector):
             self._tell()
 
     def _tell(self) -> None:
-        self._store.set(_steps_key(self._worker), str(self._steps))
+        self._store.set(_steps_key(self._worker), str(self._shown))
         self._told_s = time.monotonic()
 
 
@@ -162,6 +165,8 @@ class DistributedTeams:
         Raises:
             WorkerError: if a process dies or hangs.
         """
+        for process in range(len(self._described)):
+            self._store.delete_key(_steps_key(process))  # what it tells from here on is of this request
         self._store.set(_request_key(self._asked), _packed(request))  # type: ignore[arg-type]  # takes bytes, too
         self._waiting = beside(self._collect)
         hung = watch(self._waiting, self._steps, len(self._described), self._timeout_s)

@@ -5,6 +5,7 @@ main one looks on (:func:`watch`).
 """
 
 import contextlib
+import math
 import threading
 import time
 from collections import OrderedDict
@@ -27,6 +28,8 @@ _ASK_EVERY_S = 2.0
 
 STEPS = "steps"
 """Key of the number of steps in :meth:`TeamCollector.stats`."""
+AT_REST = math.inf
+"""The number of steps of who has nothing to do."""
 
 
 class TeamCollector(BaseCollector):
@@ -48,11 +51,13 @@ class TeamCollector(BaseCollector):
         self._stack = contextlib.ExitStack()
         self._drive = self._stack.enter_context(create_env_fn[0]())
         self._request: Request | None = None
-        self._steps = 0
+        self._steps = 0.0
+        self._shown = AT_REST
 
     def prepare(self, request: Request) -> None:
         """Say what the next batch is to be."""
         self._request = request
+        self._shown = self._steps
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yield what was asked for last, ``[N, T]``."""
@@ -60,14 +65,17 @@ class TeamCollector(BaseCollector):
             if self._request is None:
                 raise RuntimeError("prepare() says what to drive, before each batch")
             request, self._request = self._request, None
-            yield self._drive(request, self._count).tensordict()
+            driven = self._drive(request, self._count).tensordict()
+            self._shown = AT_REST
+            yield driven
 
     def _count(self) -> None:
         self._steps += 1
+        self._shown = self._steps
 
     def stats(self) -> dict[str, int | float | bool]:
-        """Tell how many steps were taken, from another thread than the one that drives."""
-        return {STEPS: self._steps}
+        """Tell how many steps were taken, or ``AT_REST``, from another thread than the one that drives."""
+        return {STEPS: self._shown}
 
     def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
         """Disconnect the simulations."""
@@ -106,7 +114,8 @@ def watch(
 
     Args:
         waiting: for the episodes.
-        steps: tells how many steps each process has taken, of those that answer; what it raises is passed on.
+        steps: tells how many steps each process has taken, or ``AT_REST``, of those that answer; what it raises is
+            passed on.
         number: of the processes.
         timeout_s: seconds in which a process must first answer, and then take a step; None: it has all the time.
 
@@ -124,7 +133,7 @@ def watch(
         told = steps()
         asked_s = time.monotonic()
         for process in range(number):
-            if process in told and told[process] != taken.get(process):
+            if process in told and (told[process] != taken.get(process) or told[process] == AT_REST):
                 taken[process], changed_s[process] = told[process], asked_s
             elif timeout_s is not None and asked_s - changed_s[process] > timeout_s and not waiting.done():
                 return process
