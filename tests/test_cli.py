@@ -148,11 +148,23 @@ def refusal(
         ),
         (
             [POW, "collector=ray", "collector.num_processes=0"],
-            "collector.num_processes=0 leaves Ray nothing to do:",
+            "collector.num_processes=0 leaves collector=ray nothin",
         ),
         (
             [POW, "collector=ray", "collector.num_processes=3"],
             "collector.num_processes=3 cannot share world.num_agents=10 evenly: give a divisor",
+        ),
+        (
+            [POW, "+collector.slurm={partition: long, timeout_min: 9}"],
+            "collector.slurm does nothing with collector=multi: take collector=distributed",
+        ),
+        (
+            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 9}"],
+            "collector.num_processes=auto counts the cores of this machine, not SLURM's",
+        ),
+        (
+            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 0}"],
+            "collector.slurm.timeout_min=0 must be at least 1",
         ),
         ([POW, "collector.num_processes=-1"], "collector.num_processes=-1 is not a number of processes"),
         ([POW, "world.num_agents=0"], "world.num_agents=0 is below 1"),

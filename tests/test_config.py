@@ -11,10 +11,13 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.pipeline.build.agent import make_actor
+from rcdsac_trl.pipeline.build.collection import make_episodes
 from rcdsac_trl.pipeline.build.read import evaluation_settings, training_settings
 from rcdsac_trl.pipeline.cli import choices, compose
 from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
+from rcdsac_trl.pipeline.saved import Progress
 from rcdsac_trl.pipeline.settings import AlgoSettings, DistortionSettings, Schedule, WorldSettings
 from rcdsac_trl.pipeline.typed import read
 from tiny import ROWS, TINY, evaluate, tiny_settings, tiny_trainer, yaml_of
@@ -319,6 +322,14 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             "schedule.neutral_iterations=0",
             "learner.max_grad_norm=1.0",
         ).run()
+    # What would start processes on other machines is told all that is chosen of them.
+    for name, teams, given in (
+        ("ray", "ray_teams.RayTeams", "collector.address=auto"),
+        ("distributed", "distributed_teams.DistributedTeams", "collector.slurm={partition: long, timeout_min: 9}"),
+    ):
+        monkeypatch.setattr(f"rcdsac_trl.pipeline.{teams}", lambda *_, **__: None)
+        settings = tiny_settings("sac", f"collector={name}", "collector.num_processes=2", given)
+        make_episodes(settings, make_actor(settings), "cpu", Progress())
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
     evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5")

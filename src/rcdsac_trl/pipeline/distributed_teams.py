@@ -57,7 +57,8 @@ class StoreTeamCollector(TeamCollector):
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         super().__init__(create_env_fn, worker_idx=worker)
         self._worker = worker
-        self._store = TCPStore(*store, is_master=False, timeout=_FOR_EVER)
+        self._store = TCPStore(*store, is_master=False)
+        self._store.set_timeout(_FOR_EVER)
         self._told_s = time.monotonic()
         self._tell()
 
