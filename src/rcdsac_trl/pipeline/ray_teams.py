@@ -12,7 +12,7 @@ from concurrent.futures import Future, wait
 from typing import Any
 
 import ray
-from ray.exceptions import RayError
+from ray.exceptions import RayError, RayTaskError
 from ray.util.placement_group import PlacementGroup, placement_group, remove_placement_group
 from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from tensordict import TensorDictBase
@@ -118,7 +118,8 @@ class RayTeams:
         """Say which processes are gone, or what one of them said."""
         answering = self._steps()
         lost = [self._name(process) for process in range(len(self._described)) if process not in answering]
-        return f"{' and '.join(lost) or 'a Ray process'} failed: {first_line(error)}"
+        cause = error.cause if isinstance(error, RayTaskError) else error
+        return f"{' and '.join(lost) or 'a Ray process'} failed: {first_line(cause)}"
 
     def _name(self, process: int) -> str:
         return f"Ray process {process + 1} of {len(self._described)} ({self._described[process]})"
