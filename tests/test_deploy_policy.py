@@ -1,5 +1,6 @@
 """The policy object: the networks' numbers are torch's, bad input stops the robot, and it recovers as it says."""
 
+import copy
 import math
 from dataclasses import replace
 from typing import Any
@@ -69,6 +70,42 @@ def test_beta_may_change_at_every_call_and_matters() -> None:
     a.act(OPEN, AHEAD, STANDING, -2.0)
     b.act(OPEN, AHEAD, STANDING, 0.0)
     assert a.act(OPEN, AHEAD, STANDING, -1.0).value == b.act(OPEN, AHEAD, STANDING, -1.0).value
+
+
+def test_it_foresees_what_it_would_do_and_expect_at_another_beta() -> None:
+    policies = [Policy(full_size(), guard=None) for _ in range(2)]
+    commands = [policy.act(OPEN, AHEAD, STANDING, beta) for policy, beta in zip(policies, (-2.0, -0.5), strict=True)]
+    foreseen = policies[0].foresee(-0.5)
+    assert foreseen.wanted == commands[1].wanted != commands[0].wanted
+    assert foreseen.quantiles is not None
+    assert np.array_equal(foreseen.quantiles, commands[1].quantiles)
+    assert foreseen.value == commands[1].value
+    # Another action's return is another one, and its own action's the same.
+    assert policies[0].foresee(-0.5, action=foreseen.action).value == foreseen.value
+    assert policies[0].foresee(-0.5, action=[-1.0, 1.0]).value != foreseen.value
+    # It has changed nothing, and a copy keeps the situation while the robot drives on.
+    kept = copy.copy(policies[0])
+    policies[0].act(OPEN, AHEAD, [0.5, 0.0], -2.0)
+    assert kept.foresee(-2.0).value == commands[0].value != policies[0].foresee(-2.0).value
+
+
+@pytest.mark.parametrize(
+    ("row", "arguments", "reason"),
+    [
+        ("rcdsac_pow", {"beta": -3.0}, "beta=-3 is outside"),
+        ("sac", {"beta": -1.0}, "beta=-1 means nothing"),
+        ("rcwr", {}, "depends on its collision weight"),
+        ("rcdsac_pow", {"action": [0.0]}, "is not two numbers"),
+        ("rcdsac_pow", {"action": [0.0, np.nan]}, "is not two numbers"),
+    ],
+)
+def test_what_cannot_be_foreseen_is_refused(row: str, arguments: dict[str, Any], reason: str) -> None:
+    policy = Policy(agent(**ROWS[row]))
+    with pytest.raises(UserInputError, match="call act"):
+        policy.foresee()
+    policy.act(OPEN, AHEAD, STANDING)
+    with pytest.raises(UserInputError, match=reason):
+        policy.foresee(**arguments)
 
 
 def test_the_default_beta_of_the_power_law_is_the_paper_s_middle() -> None:

@@ -5,9 +5,10 @@ Nothing here needs PyBullet, Hydra, TorchRL or torch, but for :mod:`rcdsac_trl.d
 
 from rcdsac_trl.deploy.checks import InputLimits, Stamps
 from rcdsac_trl.deploy.cloud import CameraPose, CloudFilter, cloud_sectors
+from rcdsac_trl.deploy.command import Command, Outlook
 from rcdsac_trl.deploy.guard import Guard
 from rcdsac_trl.deploy.path import PathFollower
-from rcdsac_trl.deploy.policy import Command, Policy
+from rcdsac_trl.deploy.policy import Policy
 from rcdsac_trl.deploy.scan import Scan, scan_sectors
 from rcdsac_trl.deploy.sectors import Mount, Sectors
 from rcdsac_trl.deploy.weights import AgentConfig, Weights, find_weights, read_weights, shipped_names
@@ -20,6 +21,7 @@ __all__ = [
     "Guard",
     "InputLimits",
     "Mount",
+    "Outlook",
     "PathFollower",
     "Policy",
     "Scan",

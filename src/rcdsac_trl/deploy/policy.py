@@ -1,6 +1,5 @@
 """The object that drives: observations in, a velocity command and the risk of it out, one call a control period."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from rcdsac_trl.deploy.checks import (
     velocity_of,
     waypoints_of,
 )
+from rcdsac_trl.deploy.command import Command, Outlook
 from rcdsac_trl.deploy.guard import Guard
 from rcdsac_trl.deploy.inference import Actor, Array, Critic, Encoders
 from rcdsac_trl.deploy.sectors import Sectors, is_finite_number
@@ -27,35 +27,6 @@ from rcdsac_trl.interface import desired_velocities, range_observation, sensor_m
 _FORGET_AFTER = 3
 _RECOVERS = "it drives on with the next good input"
 _AT_ORIGIN = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Command:
-    """What the robot should do now, and what the agent expects of it.
-
-    Attributes:
-        v_m_per_s: desired linear velocity.
-        omega_rad_per_s: desired angular velocity, counter-clockwise.
-        stopped: whether the robot stands because it must: bad input, or :meth:`Policy.stop`.
-        reason: why this is not what the agent wanted, and how that ends; None if it is.
-        wanted: what the agent wanted, (m/s, rad/s); None where it was not asked.
-        quantiles: of the return (the discounted sum of rewards from here on) for what the agent wanted, at
-            ``Policy.fractions``, the lower of the critics' each, float32 [N]; None where the agent was not asked,
-            or its critics know the mean alone.
-        value: mean of the return; None where the agent was not asked.
-        fresh: whether the agent was asked: False when it stopped, and between two of its periods.
-        forgot: whether the memory was empty before this call.
-    """
-
-    v_m_per_s: float
-    omega_rad_per_s: float
-    stopped: bool
-    reason: str | None
-    wanted: tuple[float, float] | None = None
-    quantiles: NDArray[np.float32] | None = None
-    value: float | None = None
-    fresh: bool = False
-    forgot: bool = False
 
 
 def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
@@ -124,6 +95,42 @@ class Policy:
         self._last_fresh: Stamps | None = None
         self._wanted: tuple[float, float] | None = None
         self._told: tuple[NDArray[np.float32] | None, float] | None = None
+
+    def foresee(self, beta: float | None = None, *, action: Any = None) -> Outlook:
+        """Return what the agent would do with another `beta` where it stands now, and what it expects of that.
+
+        It changes nothing: the memory, which does not depend on `beta`, is that of the last :meth:`act`. A copy,
+        ``copy.copy(policy)``, keeps the situation for later.
+
+        Args:
+            beta: how much risk to take; None: :attr:`default_beta`.
+            action: what to expect of another action than its own, [2], each in [-1, 1].
+
+        Raises:
+            UserInputError: if nothing was seen since :meth:`reset`, the agent is told a collision weight, which is
+                part of its memory, `beta` is refused by :meth:`act`, too, or `action` is no action.
+
+        Example:
+            >>> policy = Policy(weights)  # doctest: +SKIP
+            >>> policy.act(ranges, waypoints, velocity, beta=0.0)  # doctest: +SKIP
+            >>> policy.foresee(-2.0).wanted  # doctest: +SKIP
+        """
+        if self._steps == 0:
+            raise UserInputError("nothing was seen since the memory was cleared: call act() first")
+        if self.config.context == "collision_weight":
+            raise UserInputError(
+                f"the memory of {self.config.name} depends on its collision weight: call act() instead"
+            )
+        try:
+            embedded = self._embedded(self._context(beta, None))
+        except BadInputError as error:
+            raise UserInputError(str(error)) from None
+        if action is None:
+            return self._outlook(embedded)
+        asked = np.asarray(action, dtype=np.float32)
+        if asked.shape != (2,) or not np.all(np.abs(asked) <= 1.0):
+            raise UserInputError(f"action={action} is not two numbers from -1 to 1: give u_0 and u_1")
+        return self._outlook(embedded, asked)
 
     def stop(self) -> None:
         """Make every command one to stand, until :meth:`resume`."""
@@ -208,21 +215,30 @@ class Policy:
         config = self.config
         bins = range_observation(sectors.distances_m, self._mask)
         vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
-        embedded = None
         if config.context == "collision_weight" and context is not None:
             vectors.append(context)
-        elif config.embedding is not None and context is not None:
-            embedded = config.embedding[0] * context + config.embedding[1]
         self._memories = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._memories)
         self._steps += 1
-        action = self._actor.action(self._memories[0], embedded)
+        outlook = self._outlook(self._embedded(context))
+        self._wanted = outlook.wanted
+        self._told = outlook.quantiles, outlook.value
+
+    def _embedded(self, context: float | None) -> float | None:
+        """Return what the heads are told; None where they are told nothing."""
+        if self.config.embedding is None or context is None:
+            return None
+        return self.config.embedding[0] * context + self.config.embedding[1]
+
+    def _outlook(self, embedded: float | None, action: Array | None = None) -> Outlook:
+        if action is None:
+            action = self._actor.action(self._memories[0], embedded)
         told = [
             critic.values(memory, action, embedded)
             for critic, memory in zip(self._critics, self._memories[1:], strict=True)
         ]
         lower = np.min(told, axis=0)
-        self._wanted = desired_velocities(action)
-        self._told = (lower if config.critic == "quantile" else None, float(lower.mean()))
+        quantiles = lower if self.config.critic == "quantile" else None
+        return Outlook(action, desired_velocities(action), quantiles, float(lower.mean()))
 
     def _command(self, sectors: Sectors, measured: tuple[float, float], fresh: bool, forgot: bool) -> Command:
         assert self._wanted is not None

@@ -1,0 +1,53 @@
+"""What a policy answers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the robot should do now, and what the agent expects of it.
+
+    Attributes:
+        v_m_per_s: desired linear velocity.
+        omega_rad_per_s: desired angular velocity, counter-clockwise.
+        stopped: whether the robot stands because it must: bad input, or :meth:`Policy.stop`.
+        reason: why this is not what the agent wanted, and how that ends; None if it is.
+        wanted: what the agent wanted, (m/s, rad/s); None where it was not asked.
+        quantiles: of the return (the discounted sum of rewards from here on) for what the agent wanted, at
+            ``Policy.fractions``, the lower of the critics' each, float32 [N]; None where the agent was not asked,
+            or its critics know the mean alone.
+        value: mean of the return; None where the agent was not asked.
+        fresh: whether the agent was asked: False when it stopped, and between two of its periods.
+        forgot: whether the memory was empty before this call.
+    """
+
+    v_m_per_s: float
+    omega_rad_per_s: float
+    stopped: bool
+    reason: str | None
+    wanted: tuple[float, float] | None = None
+    quantiles: NDArray[np.float32] | None = None
+    value: float | None = None
+    fresh: bool = False
+    forgot: bool = False
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """What an agent would do where it is, and what it expects of that.
+
+    Attributes:
+        action: tanh(mean), or the action that was asked about, in [-1, 1], float32 [2].
+        wanted: the velocities of that action, (m/s, rad/s).
+        quantiles: of the return for it, at ``Policy.fractions``, the lower of the critics' each, float32 [N]; None
+            where the critics know the mean alone.
+        value: mean of the return.
+    """
+
+    action: NDArray[np.float32]
+    wanted: tuple[float, float]
+    quantiles: NDArray[np.float32] | None
+    value: float
