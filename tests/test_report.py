@@ -12,6 +12,8 @@ import pytest
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import __main__ as command
 from rcdsac_trl.report import findings, statistics, table
+from rcdsac_trl.report.figures import learning_curves
+from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.write import write_report
 
@@ -258,3 +260,20 @@ def test_the_command_refuses_before_it_writes(
     assert left.value.code == 2
     assert "nowhere holds no evaluation.json" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_logged_no_time_is_drawn_over_its_updates(tmp_path: Path) -> None:
+    logged, silent = tmp_path / "logged", tmp_path / "silent"
+    for folder in (logged, silent):
+        folder.mkdir()
+        (folder / "validation_episodes.csv").write_text("iteration,updates,collisions,reward\n0,200,4,10\n1,400,2,30\n")
+    scalars = logged / "csv" / "scalars" / "time"
+    scalars.mkdir(parents=True)
+    (scalars / "elapsed_s.csv").write_text("10000,60\n20000,180\n")
+    runs = validation_of_runs([logged, silent, tmp_path])
+    assert list(runs) == ["logged", "silent"]
+    assert runs["logged"]["elapsed_s"].tolist() == [60, 180]
+    panels = learning_curves(runs).axes
+    over_updates, over_minutes = ([len(axes.lines) for axes in panels[side::2]] for side in (0, 1))
+    assert (over_updates, over_minutes) == ([2, 2], [1, 1])
+    assert panels[1].lines[0].get_xdata().tolist() == [1, 3]

@@ -103,7 +103,7 @@ def learning_curves(runs: Mapping[str, pd.DataFrame]) -> Figure:
     """Draw validation reward and collisions over updates and over wall time, a line a run (mean over its betas).
 
     Args:
-        runs: validation episodes with `updates` and `elapsed_s`, by the run's name.
+        runs: validation episodes by the run's name, with `updates`; one without `elapsed_s` is drawn over updates.
     """
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     figure.suptitle("Validation during training", x=0.01, ha="left", fontsize=13, color=INK)
@@ -112,6 +112,8 @@ def learning_curves(runs: Mapping[str, pd.DataFrame]) -> Figure:
         for row, metric in enumerate(_LEARNT):
             axes = panels[row][column]
             for number, ((name, rows), color) in enumerate(zip(runs.items(), shades(len(runs)), strict=True)):
+                if clock not in rows:
+                    continue
                 means = rows.groupby(clock)[metric].mean()
                 marker = MARKERS[number % len(MARKERS)]
                 axes.plot(
