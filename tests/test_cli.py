@@ -246,6 +246,12 @@ RUN = "run=<the tiny run>"
         ([RUN, "beta=[-1]", "device=tpu"], "device=tpu is not supported"),
         ([RUN, "beta=[-1]", "map=moon"], "map=moon does not exist: choose one of "),
         ([RUN, "beta=[-1]", "task.episode_steps=3"], "task.episode_steps needs a choice of task: add task=<name>"),
+        (
+            [RUN, "beta=[-1]", "num_maps=2", "record=true", "video.map=2"],
+            "video.map=2 is not among the 2 evaluated: lower it, or raise num_maps",
+        ),
+        ([RUN, "beta=[-1]", "video.episode=-1"], "video.episode=-1 must be at least 0"),
+        ([RUN, "beta=[-1]", "video.fps=0"], "video.fps=0 must be above 0 and at most 120"),
         ([RUN, "beta=[-1]", "algo=sac"], "there is no key algo"),
         ([RUN, "beta=[-1]", "+algo=sac"], "there is no key algo"),
         ([RUN, "bta=[-1]"], "there is no key bta: did you mean beta?"),

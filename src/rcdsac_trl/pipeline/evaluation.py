@@ -85,6 +85,7 @@ class EvaluationRun:
         described: what is evaluated and how; equal descriptions give equal files.
         num_maps: maps to drive on.
         maps: yields the rows of each map as it has been driven.
+        film: writes a film into the folder of the results and returns its files; None: there is none.
 
     Raises:
         UserInputError: if the folder holds another evaluation.
@@ -97,10 +98,12 @@ class EvaluationRun:
         described: Mapping[str, Any],
         num_maps: int,
         maps: Callable[[], Generator[Rows, None, None]],
+        film: Callable[[Path], Sequence[Path]] | None = None,
     ) -> None:
         self.results = ResultsFolder(out, "evaluation.json", described)
         self.num_maps = num_maps
         self.maps = maps
+        self.film = film
 
     def run(self) -> None:
         """Drive, print the summary, and write.
@@ -121,3 +124,5 @@ class EvaluationRun:
             }
         )
         print(f"written to {self.results.path}")
+        if self.film is not None:
+            print(f"filmed: {', '.join(map(str, self.film(self.results.path)))}")

@@ -27,6 +27,13 @@ class Condition:
             return f"w_coll={self.collision_weight:g}"
         return "all"
 
+    @property
+    def heading(self) -> str:
+        """Name the condition in pictures; empty where the agent is told nothing."""
+        if self.beta is not None:
+            return f"β = {self.beta:g}"
+        return "" if self.collision_weight is None else f"w_coll = {self.collision_weight:g}"
+
 
 def contact_onsets(contact: Tensor) -> Tensor:
     """Mark the steps at which a contact begins.

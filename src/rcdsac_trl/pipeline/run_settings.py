@@ -17,6 +17,8 @@ from rcdsac_trl.pipeline.settings import AlgoSettings, LearnerSettings, Schedule
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.task import TaskSettings
 
+_MOST_FPS = 120
+
 Threads = int | Literal["auto"]
 Workers = int | Literal["auto"]
 
@@ -178,6 +180,24 @@ class ExportSettings:
 
 
 @dataclass(frozen=True)
+class VideoSettings:
+    """What an evaluation films (``video`` in ``conf/evaluate.yaml``)."""
+
+    map: int
+    episode: int
+    fps: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit."""
+        for key in ("map", "episode"):
+            _check_least(f"video.{key}", getattr(self, key), 0)
+        if not 0 < self.fps <= _MOST_FPS:
+            raise UserInputError(
+                f"video.fps={self.fps:g} must be above 0 and at most {_MOST_FPS}: choose such a number"
+            )
+
+
+@dataclass(frozen=True)
 class EvaluationSettings:
     """The root of ``conf/evaluate.yaml``."""
 
@@ -194,6 +214,8 @@ class EvaluationSettings:
     out: str | None
     num_workers: Workers
     gui: bool
+    record: bool
+    video: VideoSettings
     device: str
     threads: Threads
     map: MapSettings | None = None
@@ -211,6 +233,11 @@ class EvaluationSettings:
         _check_least("seed", self.seed, 0)
         _check_least("num_maps", self.num_maps, 1)
         _check_least("num_episodes", self.num_episodes, 1)
+        for key, number in (("map", self.num_maps), ("episode", self.num_episodes)):
+            if self.record and (filmed := getattr(self.video, key)) >= number:
+                raise UserInputError(
+                    f"video.{key}={filmed} is not among the {number} evaluated: lower it, or raise num_{key}s"
+                )
         resolve_processes(self.num_workers, self.num_maps)
         runtime.resolve_threads(self.threads)
 

@@ -90,7 +90,7 @@ class Renderer:
         self._size_px = size_px
         self._view_m = view_m
         self._fine = oversampling
-        self._font = _font(size_px / 32 * oversampling)
+        self._font = font(size_px / 32 * oversampling)
         self._background: tuple[Map, Image.Image] | None = None
 
     def draw(self, scene: Scene, caption: str = "") -> np.ndarray:
@@ -144,7 +144,8 @@ class Renderer:
         draw.text(position, caption, TEXT, font=self._font, anchor="ld")
 
 
-def _font(size: float) -> ImageFont.FreeTypeFont:
+def font(size: float) -> ImageFont.FreeTypeFont:
+    """Return the font of all pictures, of a size in pixels."""
     # Imported late: Matplotlib is slow to import, and all that is wanted here is its font, which has the Greek
     # letters that Pillow's own lacks.
     import matplotlib

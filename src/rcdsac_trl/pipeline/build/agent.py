@@ -1,5 +1,6 @@
 """Networks, their loss and what updates them."""
 
+import safetensors.torch
 import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictParams, TensorDictSequential
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -42,6 +43,19 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
         generator=torch_stream(settings.seed, "loss", device=device),
     ).to(device)
     loss.make_value_estimator(gamma=learner.gamma)
+    return loss
+
+
+def packed_loss(loss: LossModule) -> bytes:
+    """Pack the networks of a loss, so that another process can have them."""
+    # Copies: modules share their parameters with the loss, and safetensors refuses what is shared.
+    return safetensors.torch.save({key: value.clone() for key, value in loss.state_dict().items()})
+
+
+def unpacked_loss(settings: TrainingSettings, packed: bytes) -> LossModule:
+    """Make a loss on the CPU with networks that were packed."""
+    loss = make_loss(settings, "cpu")
+    loss.load_state_dict(safetensors.torch.load(packed))
     return loss
 
 

@@ -6,12 +6,11 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-import safetensors.torch
 from omegaconf import DictConfig
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import logs, runtime
-from rcdsac_trl.pipeline.build.agent import make_loss
+from rcdsac_trl.pipeline.build.agent import make_loss, packed_loss, unpacked_loss
 from rcdsac_trl.pipeline.build.read import calibration_settings, settings_of_run
 from rcdsac_trl.pipeline.build.world import environment
 from rcdsac_trl.pipeline.calibration import CalibrationRun, measure_map
@@ -55,9 +54,7 @@ def calibration(cfg: DictConfig) -> CalibrationRun:
         loss = make_loss(trained, "cpu")
         for damaged in load_weights(checkpoints, settings.checkpoint, loss=loss):
             print(f"rcdsac_trl: {damaged}", file=sys.stderr)
-        # Copies: modules share their parameters with the loss, and safetensors refuses what is shared.
-        tensors = {key: value.clone() for key, value in loss.state_dict().items()}
-        make = partial(_driver, settings, trained, conditions, safetensors.torch.save(tensors))
+        make = partial(_driver, settings, trained, conditions, packed_loss(loss))
         return drive_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
 
     described = {
@@ -93,8 +90,7 @@ def _driver(
 ) -> Iterator[Drive]:
     """Make what predicts and rolls out on one map after another, in this process."""
     runtime.set_threads(1 if settings.threads == "auto" else settings.threads)
-    loss = make_loss(trained, "cpu")
-    loss.load_state_dict(safetensors.torch.load(weights))
+    loss = unpacked_loss(trained, weights)
     group = settings.num_states * settings.num_rollouts
     world = WorldSettings(
         map_settings=trained.map,

@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import safetensors.torch
 import torch
@@ -21,9 +22,13 @@ from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import WorldSettings
+from rcdsac_trl.pipeline.teams import Team
 from rcdsac_trl.pipeline.trips import trip_metrics
 from rcdsac_trl.world.episode import draw_motor_steps, load_map
 from rcdsac_trl.world.maps import Split
+
+Wrap = Callable[[Team, TensorDictModuleBase], TensorDictModuleBase]
+"""Makes the policy that drives a team of the one that would."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +60,26 @@ class Course:
     trips: bool = False
 
 
+class Agent(NamedTuple):
+    """A trained agent as bytes, which go from process to process.
+
+    Attributes:
+        actor: the actor that drives, packed.
+        loss: the loss with its critics, packed.
+    """
+
+    actor: bytes
+    loss: bytes
+
+
 @contextlib.contextmanager
-def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
+def driver(course: Course, actor: bytes | None, *, wrap: Wrap | None = None) -> Iterator[Drive]:
     """Make what drives one map after another, in this process.
 
     Args:
         course: what is driven.
         actor: the actor's weights, packed; None: pursuit drives, which is told nothing.
+        wrap: puts something around the policy, which may change nothing of what it does.
     """
     threads = torch.get_num_threads()
     runtime.set_threads(course.threads)
@@ -72,6 +90,8 @@ def driver(course: Course, actor: bytes | None) -> Iterator[Drive]:
     )
     noise = AgentNoise(range(len(course.conditions) * course.num_episodes))
     policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
+    if wrap is not None:
+        policy = wrap(team, policy)
 
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         # By the map's number, so that it does not matter which process drives it.

@@ -3,15 +3,16 @@
 import sys
 from collections.abc import Generator
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import logs, resources, runtime
-from rcdsac_trl.pipeline.build.agent import make_average, make_loss
-from rcdsac_trl.pipeline.build.driver import Course, driver
+from rcdsac_trl.pipeline.build.agent import make_average, make_loss, packed_loss
+from rcdsac_trl.pipeline.build.driver import Agent, Course, driver
+from rcdsac_trl.pipeline.build.filming import write_film
 from rcdsac_trl.pipeline.build.read import evaluation_settings, settings_of_run, training_settings
 from rcdsac_trl.pipeline.checkpoint import load_weights
 from rcdsac_trl.pipeline.cli import compose
@@ -19,9 +20,10 @@ from rcdsac_trl.pipeline.drivers import Rows, drive_maps, resolve_processes
 from rcdsac_trl.pipeline.evaluation import EvaluationRun
 from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
-from rcdsac_trl.pipeline.saved import CHECKPOINTS, find
+from rcdsac_trl.pipeline.saved import CHECKPOINTS, Name, find
 from rcdsac_trl.pipeline.settings import WorldSettings
 from rcdsac_trl.pipeline.validation import packed
+from rcdsac_trl.pipeline.video import check_extra
 from rcdsac_trl.world.simulation import SIMULATION_BYTES
 
 
@@ -32,6 +34,8 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit.
     """
     settings = evaluation_settings(cfg)
+    if settings.record:
+        check_extra()
     trained = _trained(settings)
     algo = trained.algo if settings.run is not None else None
     conditions = [Condition()] if algo is None else algo.conditions(settings.beta, settings.collision_weight)
@@ -50,28 +54,32 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     else:
         default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
 
+    course = Course(
+        trained=trained,
+        world=world,
+        conditions=conditions,
+        split=settings.split,
+        seed=settings.seed,
+        num_episodes=settings.num_episodes,
+        sampled=settings.sampled,
+        device=device,
+        threads=1 if settings.threads == "auto" else settings.threads,
+        trips=True,
+    )
+
+    @cache  # Read once: a training that goes on may write another checkpoint meanwhile.
+    def agent() -> Agent | None:
+        return None if algo is None else _read_agent(trained, checkpoints, settings.checkpoint)
+
     def maps() -> Generator[Rows, None, None]:
-        weights = None
-        if algo is not None:
-            average = make_average(make_loss(trained, "cpu"), trained.learner)
-            for damaged in load_weights(checkpoints, settings.checkpoint, average=average):
-                print(f"rcdsac_trl: {damaged}", file=sys.stderr)
-            # Read once: a training that goes on may write another checkpoint meanwhile.
-            weights = packed(average.module)
-        course = Course(
-            trained=trained,
-            world=world,
-            conditions=conditions,
-            split=settings.split,
-            seed=settings.seed,
-            num_episodes=settings.num_episodes,
-            sampled=settings.sampled,
-            device=device,
-            threads=1 if settings.threads == "auto" else settings.threads,
-            trips=True,
-        )
-        make = partial(driver, course, weights)
+        driving = agent()
+        make = partial(driver, course, None if driving is None else driving.actor)
         return drive_maps(make, settings.num_maps, processes)
+
+    def film(folder: Path) -> list[Path]:
+        name = str(settings.baseline) if algo is None else algo.name
+        headings = [f"{name}  {condition.heading}".strip() for condition in conditions]
+        return write_film(course, agent(), settings.video, headings, folder)
 
     described = {
         "agent": settings.baseline if algo is None else algo.name,
@@ -94,7 +102,16 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         described=described,
         num_maps=settings.num_maps,
         maps=maps,
+        film=film if settings.record else None,
     )
+
+
+def _read_agent(trained: TrainingSettings, checkpoints: Path, checkpoint: Name) -> Agent:
+    loss = make_loss(trained, "cpu")
+    average = make_average(loss, trained.learner)
+    for damaged in load_weights(checkpoints, checkpoint, loss=loss, average=average):
+        print(f"rcdsac_trl: {damaged}", file=sys.stderr)
+    return Agent(packed(average.module), packed_loss(loss))
 
 
 def _trained(settings: EvaluationSettings) -> TrainingSettings:

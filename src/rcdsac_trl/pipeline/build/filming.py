@@ -1,0 +1,60 @@
+"""A film of an evaluation's episodes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from tensordict.nn import TensorDictModuleBase
+from tqdm import tqdm
+
+from rcdsac_trl.interface import MOTOR_PERIOD_S
+from rcdsac_trl.pipeline.build.agent import unpacked_loss
+from rcdsac_trl.pipeline.build.driver import Agent, Course, driver
+from rcdsac_trl.pipeline.film import Track, film
+from rcdsac_trl.pipeline.interrupts import interruption_point
+from rcdsac_trl.pipeline.predictions import QuantilePredictor
+from rcdsac_trl.pipeline.recording import Moment, Recorder
+from rcdsac_trl.pipeline.run_settings import VideoSettings
+from rcdsac_trl.pipeline.teams import Team
+from rcdsac_trl.pipeline.video import write_video
+from rcdsac_trl.world.episode import draw_motor_steps
+
+
+def write_film(
+    course: Course, agent: Agent | None, video: VideoSettings, headings: Sequence[str], folder: Path
+) -> list[Path]:
+    """Drive the episodes of a map once more, and film one under every condition.
+
+    All agents drive again, so that those that are filmed do, bit by bit, what they did when they were measured.
+
+    Args:
+        course: what is driven.
+        agent: what drives; None: pursuit drives.
+        video: which episode is filmed.
+        headings: one a condition.
+        folder: takes the files.
+
+    Returns:
+        The files.
+    """
+    tracks = recorded(course, agent, video.map, video.episode)
+    motor_steps = draw_motor_steps(course.world.task, course.split, course.seed, video.map, video.episode)
+    named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]
+    frames = tqdm(film(named, motor_steps * MOTOR_PERIOD_S), total=len(tracks[0]), unit="frame", disable=None)
+    return write_video(frames, folder / f"video-map{video.map}-episode{video.episode}", video.fps)
+
+
+def recorded(course: Course, agent: Agent | None, map_index: int, episode: int) -> list[list[Moment]]:
+    """Drive a map, and return the moments of one episode under every condition."""
+    rows = [block * course.num_episodes + episode for block in range(len(course.conditions))]
+    predictor = None
+    if agent is not None and course.trained.algo.critic == "quantile":
+        predictor = QuantilePredictor(unpacked_loss(course.trained, agent.loss).critics, rows)
+    watching: list[Recorder] = []
+
+    def watch(team: Team, policy: TensorDictModuleBase) -> Recorder:
+        watching.append(Recorder(policy, team.env.agents, rows, predictor))
+        return watching[0]
+
+    with driver(course, None if agent is None else agent.actor, wrap=watch) as drive:
+        drive(map_index, interruption_point)
+    return watching[0].tracks
