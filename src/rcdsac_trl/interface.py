@@ -156,6 +156,20 @@ def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float
     return observed
 
 
+def range_distances(observed: ArrayLike) -> NDArray[np.float64]:
+    """Return the distances of range observations, m; ``inf`` where nothing was seen. Undoes :func:`range_observation`.
+
+    Args:
+        observed: o_rng, [..., 180].
+
+    Example:
+        >>> range_distances([2.5, 1.5, 0.0]).tolist()
+        [1.0, 0.1, inf]
+    """
+    o = np.asarray(observed, dtype=np.float64)
+    return np.where(o > 0.0, 10.0 ** (o - RANGE_OFFSET), np.inf)
+
+
 def waypoint_observation(pose: tuple[float, float, float], waypoint_1: Point, waypoint_2: Point) -> tuple[float, ...]:
     """Return o_waypoint: log10 of the distance, cosine and sine of the bearing, of the next two waypoints.
 

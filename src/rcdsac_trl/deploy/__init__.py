@@ -3,6 +3,7 @@
 Nothing here needs PyBullet, Hydra, TorchRL or torch, but for :mod:`rcdsac_trl.deploy.exported`, which writes ONNX.
 """
 
+from rcdsac_trl.deploy.adaptive import BanditBeta, BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.deploy.checks import InputLimits, Stamps
 from rcdsac_trl.deploy.cloud import CameraPose, CloudFilter, cloud_sectors
 from rcdsac_trl.deploy.command import Command, Outlook
@@ -15,9 +16,13 @@ from rcdsac_trl.deploy.weights import AgentConfig, Weights, find_weights, read_w
 
 __all__ = [
     "AgentConfig",
+    "BanditBeta",
+    "BetaController",
     "CameraPose",
+    "ClearanceBeta",
     "CloudFilter",
     "Command",
+    "FixedBeta",
     "Guard",
     "InputLimits",
     "Mount",
@@ -27,6 +32,7 @@ __all__ = [
     "Scan",
     "Sectors",
     "Stamps",
+    "TailVarianceBeta",
     "Weights",
     "cloud_sectors",
     "find_weights",

@@ -22,6 +22,8 @@ from rcdsac_trl.pipeline.teams import Team
 # What an episode's row needs; everything else of a step is dropped at once.
 _OBSERVED = ("velocity", "pose")
 _HAPPENED = ("contact", "goal_reached", "reward_components")
+# Columns that say what drove an episode, as far as there are such.
+_CONDITION = ("beta", "collision_weight", "beta_controller")
 
 
 def measure_map(
@@ -32,6 +34,7 @@ def measure_map(
     num_agents: int,
     map_index: int,
     sampled: bool = False,
+    controlled: bool = False,
     before_step: Callable[[], None] = interruption_point,
     more: Callable[[TensorDictBase], dict[str, Tensor]] | None = None,
 ) -> Rows:
@@ -45,6 +48,7 @@ def measure_map(
         num_agents: episodes a map and a condition.
         map_index: number of the map and its episode.
         sampled: draw actions instead of taking tanh(mean).
+        controlled: say in `beta_controller` what turned beta.
         before_step: called before each step.
         more: measures more of the episodes, ``[N]`` a column.
 
@@ -60,12 +64,14 @@ def measure_map(
     rows = []
     for i in range(len(conditions) * num_agents):
         condition = conditions[i // num_agents]
-        row = {
+        row: dict[str, Any] = {
             "beta": condition.beta,
             "collision_weight": condition.collision_weight,
             "map": map_index,
             "episode": i % num_agents,
         }
+        if controlled:
+            row["beta_controller"] = condition.controller
         rows.append(row | {metric: values[i].item() for metric, values in measured.items()})
     return rows
 
@@ -74,7 +80,8 @@ def table_of(maps: Iterable[Rows]) -> pd.DataFrame:
     """Return the rows of all maps in the order of condition, map and episode, whatever order they come in."""
     rows = [row for rows in maps for row in rows]
     table = pd.DataFrame(rows).astype({"beta": float, "collision_weight": float})
-    return table.sort_values(["beta", "collision_weight", "map", "episode"], ignore_index=True)
+    by = [key for key in _CONDITION if key in table]
+    return table.sort_values([*by, "map", "episode"], ignore_index=True)
 
 
 class EvaluationRun:
@@ -85,6 +92,7 @@ class EvaluationRun:
         described: what is evaluated and how; equal descriptions give equal files.
         num_maps: maps to drive on.
         maps: yields the rows of each map as it has been driven.
+        more: makes further rows of all rows that were driven; None: there are none.
         film: writes a film into the folder of the results and returns its files; None: there is none.
 
     Raises:
@@ -98,11 +106,13 @@ class EvaluationRun:
         described: Mapping[str, Any],
         num_maps: int,
         maps: Callable[[], Generator[Rows, None, None]],
+        more: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
         film: Callable[[Path], Sequence[Path]] | None = None,
     ) -> None:
         self.results = ResultsFolder(out, "evaluation.json", described)
         self.num_maps = num_maps
         self.maps = maps
+        self.more = more
         self.film = film
 
     def run(self) -> None:
@@ -114,9 +124,11 @@ class EvaluationRun:
         # Closed here and now where Ctrl-C comes between two maps, and with them what drives.
         with contextlib.closing(self.maps()) as maps:
             episodes = table_of(tqdm(maps, total=self.num_maps, unit="map", disable=None))
-        summary = summarise(episodes, ["beta", "collision_weight"])
+        if self.more is not None:
+            episodes = pd.concat([episodes, self.more(episodes)], ignore_index=True)
+        summary = summarise(episodes, [key for key in _CONDITION if key in episodes])
         shown = summary.dropna(axis="columns", how="all").set_index("episodes")
-        print(shown.T.to_string(header=True, float_format="%.3f"))
+        print(shown.T.to_string(header=True, float_format="{:.3f}".format, na_rep=""))
         self.results.write(
             {
                 "episodes.csv": episodes.to_csv(index=False, float_format="%.9g"),

@@ -14,13 +14,16 @@ METRICS = ("collisions", "reward", "goals", "mean_speed_m_per_s", "contact_fract
 
 @dataclass(frozen=True)
 class Condition:
-    """What an agent is told for a whole episode: beta, a collision weight, or nothing."""
+    """What an agent is told for a whole episode: beta, a collision weight, or nothing; or what turns its beta."""
 
     beta: float | None = None
     collision_weight: float | None = None
+    controller: str | None = None
 
     def __str__(self) -> str:
         """Name the condition in logs and tables."""
+        if self.controller is not None:
+            return self.controller
         if self.beta is not None:
             return f"beta={self.beta:g}"
         if self.collision_weight is not None:
@@ -30,6 +33,8 @@ class Condition:
     @property
     def heading(self) -> str:
         """Name the condition in pictures; empty where the agent is told nothing."""
+        if self.controller is not None:
+            return self.controller.replace("_", " ")
         if self.beta is not None:
             return f"β = {self.beta:g}"
         return "" if self.collision_weight is None else f"w_coll = {self.collision_weight:g}"

@@ -198,12 +198,37 @@ class VideoSettings:
 
 
 @dataclass(frozen=True)
+class ControllerSettings:
+    """How controllers turn beta (``controller`` in ``conf/evaluate.yaml``); see :mod:`rcdsac_trl.deploy.adaptive`."""
+
+    near_m: float
+    far_m: float
+    window_steps: int
+    step_size: float
+    exploration: float
+
+    def __post_init__(self) -> None:
+        """Refuse what the controllers would."""
+        if not 0.0 < self.near_m < self.far_m:
+            raise UserInputError(
+                f"controller.near_m={self.near_m:g} must be above 0 and below controller.far_m={self.far_m:g}"
+            )
+        _check_least("controller.window_steps", self.window_steps, 2)
+        if self.step_size <= 0:
+            raise UserInputError(f"controller.step_size={self.step_size:g} must be above 0")
+        if not 0.0 <= self.exploration <= 1.0:
+            raise UserInputError(f"controller.exploration={self.exploration:g} must be from 0 to 1")
+
+
+@dataclass(frozen=True)
 class EvaluationSettings:
     """The root of ``conf/evaluate.yaml``."""
 
     run: str | None
     beta: tuple[float, ...] | None
     collision_weight: tuple[float, ...] | None
+    beta_controller: tuple[Literal["clearance", "tail_variance", "bandit"], ...] | None
+    controller: ControllerSettings
     checkpoint: Literal["best", "last"]
     baseline: Literal["pursuit"] | None
     split: Literal["evaluation", "validation"]
@@ -230,6 +255,14 @@ class EvaluationSettings:
             raise UserInputError("out names no folder: give it one, or leave it out")
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
+        asked = self.beta_controller or ()
+        if asked and len(self.beta or ()) < 2:
+            raise UserInputError(
+                f"beta_controller=[{','.join(asked)}] turns beta between the values of beta: give two or more of them"
+            )
+        for name in asked:
+            if asked.count(name) > 1:
+                raise UserInputError(f"beta_controller={name} is given more than once: name every one once")
         _check_least("seed", self.seed, 0)
         _check_least("num_maps", self.num_maps, 1)
         _check_least("num_episodes", self.num_episodes, 1)

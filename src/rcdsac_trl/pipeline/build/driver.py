@@ -12,15 +12,18 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from rcdsac_trl.deploy.adaptive import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.pipeline import runtime
-from rcdsac_trl.pipeline.build.agent import make_actor, make_policy
+from rcdsac_trl.pipeline.adaptive import AdaptivePolicy
+from rcdsac_trl.pipeline.build.agent import make_actor, make_policy, unpacked_loss
 from rcdsac_trl.pipeline.build.world import evaluation_team
 from rcdsac_trl.pipeline.drivers import Drive, Rows
 from rcdsac_trl.pipeline.evaluation import measure_map
 from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.policies import AgentNoise, PursuitPolicy
-from rcdsac_trl.pipeline.run_settings import TrainingSettings
+from rcdsac_trl.pipeline.predictions import QuantilePredictor
+from rcdsac_trl.pipeline.run_settings import ControllerSettings, TrainingSettings
 from rcdsac_trl.pipeline.settings import WorldSettings
 from rcdsac_trl.pipeline.teams import Team
 from rcdsac_trl.pipeline.trips import trip_metrics
@@ -29,6 +32,8 @@ from rcdsac_trl.world.maps import Split
 
 Wrap = Callable[[Team, TensorDictModuleBase], TensorDictModuleBase]
 """Makes the policy that drives a team of the one that would."""
+Measure = Callable[[int, TensorDictBase], dict[str, Tensor]]
+"""Measures the episodes of the map of a number, ``[N]`` a column."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class Course:
         device: where the policy acts.
         threads: that torch uses for one operation while it drives.
         trips: measure the ways driven, too.
+        controller: settings of controllers, which then tell all agents beta; None: nothing turns it.
     """
 
     trained: TrainingSettings
@@ -58,6 +64,7 @@ class Course:
     device: str
     threads: int
     trips: bool = False
+    controller: ControllerSettings | None = None
 
 
 class Agent(NamedTuple):
@@ -73,12 +80,15 @@ class Agent(NamedTuple):
 
 
 @contextlib.contextmanager
-def driver(course: Course, actor: bytes | None, *, wrap: Wrap | None = None) -> Iterator[Drive]:
+def driver(
+    course: Course, actor: bytes | None, loss: bytes | None = None, *, wrap: Wrap | None = None
+) -> Iterator[Drive]:
     """Make what drives one map after another, in this process.
 
     Args:
         course: what is driven.
         actor: the actor's weights, packed; None: pursuit drives, which is told nothing.
+        loss: the loss with the critics, packed; read where a condition's controller needs their quantiles.
         wrap: puts something around the policy, which may change nothing of what it does.
     """
     threads = torch.get_num_threads()
@@ -90,6 +100,10 @@ def driver(course: Course, actor: bytes | None, *, wrap: Wrap | None = None) -> 
     )
     noise = AgentNoise(range(len(course.conditions) * course.num_episodes))
     policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
+    more: list[Measure] = [partial(_trips, course)] if course.trips else []
+    if course.controller is not None:
+        policy = adaptive = _adaptive(course, course.controller, policy, loss)
+        more.append(lambda *_: {"mean_beta": adaptive.mean_betas()})
     if wrap is not None:
         policy = wrap(team, policy)
 
@@ -103,8 +117,9 @@ def driver(course: Course, actor: bytes | None, *, wrap: Wrap | None = None) -> 
             num_agents=course.num_episodes,
             map_index=map_index,
             sampled=course.sampled,
+            controlled=course.controller is not None,
             before_step=before_step,
-            more=partial(_trips, course, map_index) if course.trips else None,
+            more=partial(_all, more, map_index) if more else None,
         )
 
     try:
@@ -112,6 +127,34 @@ def driver(course: Course, actor: bytes | None, *, wrap: Wrap | None = None) -> 
     finally:
         team.close()
         torch.set_num_threads(threads)
+
+
+def _all(measures: Sequence[Measure], map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:
+    return {name: value for measure in measures for name, value in measure(map_index, episodes).items()}
+
+
+def _adaptive(
+    course: Course, settings: ControllerSettings, policy: TensorDictModuleBase, loss: bytes | None
+) -> AdaptivePolicy:
+    """Let controllers tell the agents beta, also those whose beta is fixed."""
+    betas = [condition.beta for condition in course.conditions if condition.beta is not None]
+    low, high = min(betas), max(betas)
+    controllers: list[BetaController] = []
+    for condition in course.conditions:
+        for _ in range(course.num_episodes):
+            if condition.beta is not None:
+                controllers.append(FixedBeta(condition.beta))
+            elif condition.controller == "clearance":
+                # What the agent does not see is not among its observations.
+                controllers.append(ClearanceBeta(low, high, near_m=settings.near_m, far_m=settings.far_m))
+            else:
+                controllers.append(TailVarianceBeta(low, high, window_steps=settings.window_steps))
+    readers = [row for row, controller in enumerate(controllers) if isinstance(controller, TailVarianceBeta)]
+    predictor = None
+    if readers:
+        assert loss is not None
+        predictor = QuantilePredictor(unpacked_loss(course.trained, loss).critics, readers)
+    return AdaptivePolicy(policy, controllers, predictor)
 
 
 def _trips(course: Course, map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:

@@ -6,10 +6,13 @@ from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 
+import pandas as pd
 from omegaconf import DictConfig
 
+from rcdsac_trl.deploy.adaptive import BanditBeta
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import logs, resources, runtime
+from rcdsac_trl.pipeline.adaptive import BANDIT, play_bandit
 from rcdsac_trl.pipeline.build.agent import make_average, make_loss, packed_loss
 from rcdsac_trl.pipeline.build.driver import Agent, Course, driver
 from rcdsac_trl.pipeline.build.filming import write_film
@@ -24,6 +27,7 @@ from rcdsac_trl.pipeline.saved import CHECKPOINTS, Name, find
 from rcdsac_trl.pipeline.settings import WorldSettings
 from rcdsac_trl.pipeline.validation import packed
 from rcdsac_trl.pipeline.video import check_extra
+from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.simulation import SIMULATION_BYTES
 
 
@@ -39,7 +43,10 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     trained = _trained(settings)
     algo = trained.algo if settings.run is not None else None
     conditions = [Condition()] if algo is None else algo.conditions(settings.beta, settings.collision_weight)
-    world = _evaluation_world(settings, trained, len(conditions))
+    controllers = settings.beta_controller or ()
+    # The bandit's episodes are among those of the fixed values: none is driven for it.
+    driven = [*conditions, *(Condition(controller=name) for name in controllers if name != BANDIT)]
+    world = _evaluation_world(settings, trained, len(driven))
     device = runtime.resolve_device(settings.device)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
     simulations = max(1, processes) * world.num_agents
@@ -49,7 +56,7 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     if settings.run is not None:
         checkpoints = Path(settings.run) / CHECKPOINTS
         find(checkpoints, settings.checkpoint)
-        told = "".join(f"-{condition}".replace("=", "_") for condition in conditions)
+        told = "".join(f"-{name}".replace("=", "_") for name in [*map(str, conditions), *controllers])
         default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{told}"
     else:
         default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
@@ -57,7 +64,7 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     course = Course(
         trained=trained,
         world=world,
-        conditions=conditions,
+        conditions=driven,
         split=settings.split,
         seed=settings.seed,
         num_episodes=settings.num_episodes,
@@ -65,6 +72,7 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         device=device,
         threads=1 if settings.threads == "auto" else settings.threads,
         trips=True,
+        controller=settings.controller if controllers else None,
     )
 
     @cache  # Read once: a training that goes on may write another checkpoint meanwhile.
@@ -72,13 +80,12 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         return None if algo is None else _read_agent(trained, checkpoints, settings.checkpoint)
 
     def maps() -> Generator[Rows, None, None]:
-        driving = agent()
-        make = partial(driver, course, None if driving is None else driving.actor)
+        make = partial(driver, course, *(agent() or (None,)))
         return drive_maps(make, settings.num_maps, processes)
 
     def film(folder: Path) -> list[Path]:
         name = str(settings.baseline) if algo is None else algo.name
-        headings = [f"{name}  {condition.heading}".strip() for condition in conditions]
+        headings = [f"{name}  {condition.heading}".strip() for condition in driven]
         return write_film(course, agent(), settings.video, headings, folder)
 
     described = {
@@ -92,18 +99,32 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         "num_maps": settings.num_maps,
         "num_episodes": settings.num_episodes,
         "sampled": settings.sampled,
-        "conditions": [str(condition) for condition in conditions],
+        "conditions": [*map(str, conditions), *controllers],
         "map": asdict(world.map_settings),
         "task": asdict(world.task),
         "commit": logs.commit(),
-    }
+    } | ({"controller": asdict(settings.controller)} if controllers else {})
     return EvaluationRun(
         out=Path(settings.out) if settings.out is not None else default_out,
         described=described,
         num_maps=settings.num_maps,
         maps=maps,
+        more=partial(_played, settings) if BANDIT in controllers else None,
         film=film if settings.record else None,
     )
+
+
+def _played(settings: EvaluationSettings, episodes: pd.DataFrame) -> pd.DataFrame:
+    """Return the episodes that a bandit would have driven."""
+    chosen, turned = settings.beta, settings.controller
+    assert chosen is not None
+    bandit = BanditBeta(
+        sorted(chosen),
+        stream(settings.seed, "beta bandit"),
+        step_size=turned.step_size,
+        exploration=turned.exploration,
+    )
+    return play_bandit(episodes, bandit)
 
 
 def _read_agent(trained: TrainingSettings, checkpoints: Path, checkpoint: Name) -> Agent:

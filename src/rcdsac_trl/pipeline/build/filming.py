@@ -55,6 +55,7 @@ def recorded(course: Course, agent: Agent | None, map_index: int, episode: int) 
         watching.append(Recorder(policy, team.env.agents, rows, predictor))
         return watching[0]
 
-    with driver(course, None if agent is None else agent.actor, wrap=watch) as drive:
+    actor, loss = (None, None) if agent is None else agent
+    with driver(course, actor, loss, wrap=watch) as drive:
         drive(map_index, interruption_point)
     return watching[0].tracks

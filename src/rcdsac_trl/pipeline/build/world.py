@@ -113,7 +113,8 @@ def _told(
         )
     measure = algo.distortion.measure
     if conditions is not None:
-        fixed = [c.beta for c in conditions if c.beta is not None]
+        # A controller tells its agents at every step; they must be told something before.
+        fixed = [measure.low if c.beta is None else c.beta for c in conditions if c.beta is not None or c.controller]
     return EpisodeSampler(
         "risk",
         measure.from_uniform,
