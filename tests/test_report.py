@@ -191,6 +191,7 @@ def test_findings_by_hand(tmp_path: Path) -> None:
     assert (first["difference"], first["low"], first["high"]) == (-1.0, -1.0, -1.0)
     # 0 1 2 against 1 2 3: fewer in 6 of 9 pairs, equal in 2.
     assert first["better"] == pytest.approx((6 + 1) / 9)
+    assert findings.adaptive(episodes).empty
     trends = findings.trends(episodes).set_index("metric")
     assert trends["correlation"].round(9).to_dict() == {
         "collisions": 1.0,
@@ -201,6 +202,43 @@ def test_findings_by_hand(tmp_path: Path) -> None:
     }
     assert trends.loc["collisions", "p_value"] < 0.01
     assert trends.loc["goals", "p_value"] == 1.0
+
+
+def with_controllers(folder: Path, agent: str, told: dict[float, float], turned: dict[str, float]) -> Path:
+    """Write an evaluation in which controllers had so many collisions more than :func:`evaluate`'s number."""
+    evaluate(folder, agent, told | {10.0 + i: more for i, more in enumerate(turned.values())})
+    episodes = pd.read_csv(folder / "episodes.csv")
+    names = {10.0 + i: name for i, name in enumerate(turned)}
+    episodes["beta_controller"] = episodes["beta"].map(names)
+    episodes["mean_beta"] = episodes["beta"].where(episodes["beta"] < 10.0, -1.25)
+    episodes["beta"] = episodes["beta"].where(episodes["beta"] < 10.0)
+    episodes.to_csv(folder / "episodes.csv", index=False)
+    return folder
+
+
+def test_controllers_are_compared_with_the_best_fixed_beta(tmp_path: Path) -> None:
+    run = with_controllers(tmp_path / "a", "rcdsac_pow", {-2.0: 2, -1.0: 1}, {"clearance": 0, "bandit": 1})
+    episodes = read_episodes([run, evaluate(tmp_path / "b", "sac", {NONE: 3})])
+    found = findings.adaptive(episodes).set_index(["controller", "metric"])
+    assert found["best_beta"].tolist() == [-1.0] * 4
+    assert found["mean_beta"].tolist() == [-1.25] * 4
+    assert found["difference"].to_dict() == pytest.approx(
+        {
+            ("bandit", "collisions"): 0.0,
+            ("clearance", "collisions"): -1.0,
+            ("bandit", "reward"): 0.0,
+            ("clearance", "reward"): 5.0,
+        }
+    )
+    # Six maps, all one way: 2 of 2^6 sign patterns are as extreme, times two controllers.
+    assert found.loc[("clearance", "collisions"), "p_value"] == pytest.approx(2 * 2 / 2**6, abs=0.04)
+    assert found.loc[("bandit", "collisions"), "p_value"] == 1.0
+    assert "RC-DSAC (resample) pow β by clearance" in findings.labels(episodes)
+    # The paper's table is of fixed betas.
+    assert table.comparison(episodes)[("", "β")].tolist() == ["-2", "-1", ""]
+    write_report(episodes, [run], tmp_path / "out")
+    assert "Does it pay to turn beta?" in (tmp_path / "out" / "report.html").read_text()
+    assert len(pd.read_csv(tmp_path / "out" / "adaptive.csv")) == 4
 
 
 class Images(HTMLParser):

@@ -27,6 +27,8 @@ _LEARNT = ("reward", "collisions")
 def beta_response(episodes: Episodes, measure: str) -> Figure | None:
     """Draw what beta does: collisions, speed, goals and realised tail return, with 95 % intervals.
 
+    What controllers that turn beta reach stands at the beta they used on the mean.
+
     Args:
         episodes: of all agents.
         measure: its agents are drawn, such as ``pow``; betas of two measures share no axis.
@@ -57,6 +59,7 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
             _draw_intervals(
                 axes, ordered["beta"], [statistics.bootstrap(v, statistic) for v in values], color, marker, name
             )
+            _draw_turned(axes, episodes, rows.iloc[0], metric, statistic, color)
             if metric == "reward":
                 axes.plot(
                     ordered["beta"], [statistics.mean(v) for v in values], color=color, linestyle="--", linewidth=1.2
@@ -140,3 +143,24 @@ def _draw_intervals(
     middle = [interval.value for interval in intervals]
     axes.fill_between(x, [i.low for i in intervals], [i.high for i in intervals], color=color, alpha=0.15, linewidth=0)
     axes.plot(x, middle, color=color, marker=marker, markersize=6, linewidth=1.9, label=label)
+
+
+def _draw_turned(
+    axes: Axes,
+    episodes: Episodes,
+    of: pd.Series,
+    metric: str,
+    statistic: Statistic,
+    color: tuple[float, float, float, float],
+) -> None:
+    """Draw the controllers of an agent, each as a point with its interval and name."""
+    conditions = episodes.conditions
+    same = (conditions["agent"] == of["agent"]) & (conditions["sensor"] == of["sensor"])
+    for _, condition in conditions[same & conditions["beta_controller"].notna()].iterrows():
+        beta = statistics.mean(episodes.of(condition, "mean_beta"))
+        found = statistics.bootstrap(episodes.of(condition, metric), statistic)
+        axes.plot([beta, beta], [found.low, found.high], color=color, linewidth=1.2)
+        axes.plot(beta, found.value, marker="*", markersize=11, color=color, markeredgecolor="white", linestyle="none")
+        name = condition["beta_controller"].replace("_", " ")
+        at = (beta, found.value)
+        axes.annotate(name, at, textcoords="offset points", xytext=(6, 4), fontsize=8, color=INK)

@@ -1,4 +1,4 @@
-"""Statistics of all conditions as tables: summaries, comparisons in pairs, and trends in beta."""
+"""Statistics of all conditions as tables: summaries, comparisons in pairs, trends in beta, what turning it brings."""
 
 import itertools
 
@@ -26,9 +26,10 @@ _BETTER_DOWN = {"collisions"}
 def labels(episodes: Episodes) -> list[str]:
     """Name the conditions, in their order."""
     sensors = episodes.conditions["sensor"].nunique()
-    agents, names, betas, weights = (episodes.conditions[key].tolist() for key in CONDITION)
-    rows = zip(agents, names, betas, weights, strict=True)
-    return [condition_label(agent, sensor, beta, weight, sensors) for agent, sensor, beta, weight in rows]
+    columns = (episodes.conditions[key].tolist() for key in CONDITION)
+    agents, names, betas, weights, controllers = columns
+    rows = zip(agents, names, betas, weights, controllers, strict=True)
+    return [condition_label(agent, name, beta, weight, by, sensors) for agent, name, beta, weight, by in rows]
 
 
 def summary(episodes: Episodes) -> pd.DataFrame:
@@ -103,4 +104,46 @@ def trends(episodes: Episodes) -> pd.DataFrame:
         for metric, values in columns.items():
             found = statistics.trend(np.stack(values, 1))
             rows.append({"agent": agent, "sensor": sensor, "metric": metric, "settings": len(ordered)} | vars(found))
+    return pd.DataFrame(rows)
+
+
+def adaptive(episodes: Episodes) -> pd.DataFrame:
+    """Compare every controller of beta with the best fixed beta of the same agent, on the same maps.
+
+    The best one is chosen for each metric by these very episodes, which favours it.
+
+    Returns:
+        One row a controller and metric: `agent`, `sensor`, `controller`, `mean_beta`, `metric`, `value`; `best_beta`
+        and `best_value`; `difference` from it, `low`, `high`; and `p_value`, adjusted by Holm's method for the agent's
+        number of controllers.
+    """
+    rows = []
+    for (agent, sensor), conditions in episodes.conditions.groupby(["agent", "sensor"], sort=False):
+        turned = conditions[conditions["beta_controller"].notna()]
+        fixed = [condition for _, condition in conditions.dropna(subset="beta").iterrows()]
+        for metric in _COMPARED:
+            means = [statistics.mean(episodes.of(condition, metric)) for condition in fixed]
+            found = []
+            for _, condition in turned.iterrows():
+                best = int(np.argmin(means) if metric in _BETTER_DOWN else np.argmax(means))
+                values = episodes.of(condition, metric)
+                compared = statistics.compare(values, episodes.of(fixed[best], metric))
+                found.append(
+                    {
+                        "agent": agent,
+                        "sensor": sensor,
+                        "controller": condition["beta_controller"],
+                        "mean_beta": statistics.mean(episodes.of(condition, "mean_beta")),
+                        "metric": metric,
+                        "value": statistics.mean(values),
+                        "best_beta": fixed[best]["beta"],
+                        "best_value": means[best],
+                        "difference": compared.difference.value,
+                        "low": compared.difference.low,
+                        "high": compared.difference.high,
+                        "p_value": compared.p_value,
+                    }
+                )
+            adjusted = statistics.holm([row["p_value"] for row in found])
+            rows += [row | {"p_value": p_value} for row, p_value in zip(found, adjusted, strict=True)]
     return pd.DataFrame(rows)

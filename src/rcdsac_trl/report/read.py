@@ -14,7 +14,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.statistics import Array
 
 DESCRIPTION = "evaluation.json"
-CONDITION = ("agent", "sensor", "beta", "collision_weight")
+CONDITION = ("agent", "sensor", "beta", "collision_weight", "beta_controller")
 """Columns that say what drove an episode."""
 _EPISODE = ("train_seed", "map", "episode")
 # What must be equal for agents to have met the same maps, starts, goals and movers, under the same rules.
@@ -93,6 +93,8 @@ def read_evaluation(folder: Path) -> Evaluation:
         raise UserInputError(f"{folder} cannot be read ({error}): evaluate again into another folder") from error
     if missing:
         raise UserInputError(f"{folder} does not say {', '.join(sorted(missing))}: evaluate again with this version")
+    if "beta_controller" not in episodes:  # nothing turned beta
+        episodes = episodes.assign(beta_controller=None, mean_beta=episodes["beta"])
     return Evaluation(folder, described, episodes)
 
 
@@ -101,7 +103,8 @@ class Episodes:
     """The episodes of several evaluations on the same maps.
 
     Attributes:
-        table: one row an episode: :data:`CONDITION`, `train_seed`, `map`, `episode` and the metrics that all have.
+        table: one row an episode: :data:`CONDITION`, `mean_beta`, `train_seed`, `map`, `episode` and the metrics that
+            all have.
         protocol: of all evaluations.
     """
 
@@ -115,13 +118,12 @@ class Episodes:
 
     @cached_property
     def conditions(self) -> pd.DataFrame:
-        """One row a condition, with the agent's measure, in the order of the evaluations, then by beta."""
+        """One row a condition, with the agent's measure, by evaluation, beta, and controller of it."""
         rows = self.table[[*CONDITION, "measure"]].drop_duplicates()
         agents = list(rows["agent"].unique())
         rows = rows.assign(order=rows["agent"].map(agents.index))
-        return rows.sort_values(["sensor", "order", "beta", "collision_weight"], ignore_index=True).drop(
-            columns="order"
-        )
+        by = ["sensor", "order", "beta", "collision_weight", "beta_controller"]
+        return rows.sort_values(by, ignore_index=True).drop(columns="order")
 
     def of(self, condition: pd.Series, metric: str) -> Array:
         """Return a metric under a condition: ``[training seeds, maps, episodes]``."""

@@ -23,7 +23,8 @@ def paper_table() -> pd.DataFrame:
 
 def own_table(episodes: Episodes) -> pd.DataFrame:
     """Return mean and standard deviation (ddof 0) over the episodes, in the form of :func:`paper_table`."""
-    groups = episodes.table.groupby([*KEY, "sensor"], dropna=False, sort=False)
+    fixed = episodes.table[episodes.table["beta_controller"].isna()]  # the paper turns no beta
+    groups = fixed.groupby([*KEY, "sensor"], dropna=False, sort=False)
     parts: dict[str, pd.Series] = {"episodes": groups.size()}
     for metric in TABULATED:
         parts |= {f"{metric}_mean": groups[metric].mean(), f"{metric}_std": groups[metric].std(ddof=0)}
@@ -50,10 +51,15 @@ def averages(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["name", "sensor", "collisions", "reward"])
 
 
-def condition_label(agent: str, sensor: str, beta: float, weight: float, sensors: int = 1) -> str:
+def condition_label(
+    agent: str, sensor: str, beta: float, weight: float, controller: str | None, sensors: int = 1
+) -> str:
     """Name a condition in figures and lists; the sensor only where there are several."""
     name, psi = _called(agent)
-    told = f" β = {beta:g}" if pd.notna(beta) else f" w_coll = {weight:g}" if pd.notna(weight) else ""
+    if isinstance(controller, str):
+        told = f" β by {controller.replace('_', ' ')}"
+    else:
+        told = f" β = {beta:g}" if pd.notna(beta) else f" w_coll = {weight:g}" if pd.notna(weight) else ""
     return f"{name}{' ' + psi if psi else ''}{told}{', ' + sensor if sensors > 1 else ''}"
 
 

@@ -12,6 +12,16 @@ from rcdsac_trl.report.page import Part, page
 from rcdsac_trl.report.read import METRIC_NAMES, Episodes
 from rcdsac_trl.report.statistics import CONFIDENCE, PERMUTATIONS
 
+_ADAPTIVE = (
+    "Controllers turn beta while the agent drives. Each is compared, map by map, with the best of the fixed betas on "
+    "the same maps, starts and goals: the one with the fewest collisions, or with the most reward. That one is chosen "
+    "by these very episodes, which favours it a little. p-values are adjusted by Holm's method for the number of "
+    "controllers.",
+    "clearance: by the nearest thing the sensor sees. tail_variance: by the lower tail of the return that the critics "
+    "expect. bandit: one beta an episode, chosen by the returns of the episodes before, over the maps in their order; "
+    "so its maps are not independent, and its interval and p-value are a rough guide.",
+)
+
 
 def write_report(episodes: Episodes, folders: Sequence[Path], out: Path) -> None:
     """Write everything.
@@ -25,13 +35,17 @@ def write_report(episodes: Episodes, folders: Sequence[Path], out: Path) -> None
     paper = table.comparison(episodes)
     table.write_table(paper, out / "table")
     summary, pairs, trends = findings.summary(episodes), findings.comparisons(episodes), findings.trends(episodes)
+    turned = findings.adaptive(episodes)
     means = pd.concat([table.averages(table.paper_table()).assign(source="paper"), _own_averages(episodes)])
-    for name, values in (("summary", summary), ("comparisons", pairs), ("trends", trends), ("averages", means)):
+    tables = {"summary": summary, "comparisons": pairs, "trends": trends, "averages": means}
+    if len(turned):
+        tables["adaptive"] = turned
+    for name, values in tables.items():
         values.to_csv(out / f"{name}.csv", index=False, float_format="%.6g")
     figures = _figures(episodes, folders)
     for name, figure in figures.items():
         figure.savefig(out / f"{name}.png", dpi=130)
-    sections = _sections(episodes, paper, summary, pairs, trends, means, figures)
+    sections = _sections(episodes, paper, summary, pairs, trends, means, turned, figures)
     (out / "report.html").write_text(page("What was found", sections))
 
 
@@ -73,6 +87,7 @@ def _sections(
     pairs: pd.DataFrame,
     trends: pd.DataFrame,
     means: pd.DataFrame,
+    turned: pd.DataFrame,
     figures: dict[str, Figure],
 ) -> list[tuple[str, list[Part]]]:
     kept = episodes.protocol
@@ -130,6 +145,8 @@ def _sections(
             ],
         ),
     ]
+    if len(turned):
+        sections.insert(2, ("Does it pay to turn beta?", [*_ADAPTIVE, _text(turned)]))
     return [*sections, ("Learning", learnt)] if learnt else sections
 
 
