@@ -260,7 +260,13 @@ RUN = "run=<the tiny run>"
             "beta_controller=[clearance] turns beta between the values of beta: give two or more of them",
         ),
         ([RUN, "beta=[-2,-1]", "beta_controller=[bandit,bandit]"], "beta_controller=bandit is given more than once"),
-        ([RUN, "beta=[-2,-1]", "beta_controller=[mood]"], "beta_controller=['mood'] must be "),
+        (
+            [RUN, "beta=[-2,-1]", "beta_controller=[mood]"],
+            (
+                [RUN, "beta=[-2,-1]", "beta_controller=[mood]"],
+                "beta_controller=['mood'] must be a list of some of clearance, tail_variance, bandit in brackets or null",
+            ),
+        ),
         (
             [RUN, "beta=[-2,-1]", "controller.near_m=2"],
             "controller.near_m=2 must be above 0 and below controller.far_m=1.2",

@@ -137,8 +137,9 @@ class TailVarianceBeta:
 
     Example:
         >>> controller = TailVarianceBeta(-2.0, 0.0)
-        >>> [controller(np.full(180, np.inf), tail) for tail in np.array([[0.0, 2.0], [0.0, 8.0], [0.0, 1.0]])]
-        [-1.0, -1.5, -0.33333333333333326]
+        >>> tails = np.array([[0.0, 2.0], [0.0, 8.0], [0.0, 1.0]])
+        >>> [round(controller(np.full(180, np.inf), quantiles), 2) for quantiles in tails]
+        [-1.0, -1.5, -0.33]
     """
 
     def __init__(self, low: float, high: float, *, window_steps: int = 200) -> None:

@@ -108,6 +108,8 @@ def _describe(hint: Any) -> str:
     if origin is Literal:
         return ("one of " if len(args) > 1 else "") + ", ".join(str(arg) for arg in args)
     if origin is tuple:
+        if get_origin(args[0]) is Literal:
+            return f"a list of some of {', '.join(map(str, get_args(args[0])))} in brackets"
         number = "" if args[-1] is Ellipsis else f"{len(args)} "
         return f"a list of {number}{_PLURALS[args[0]]} in brackets"
     return _NAMES.get(hint, "a section with keys of its own")
