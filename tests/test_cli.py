@@ -262,10 +262,7 @@ RUN = "run=<the tiny run>"
         ([RUN, "beta=[-2,-1]", "beta_controller=[bandit,bandit]"], "beta_controller=bandit is given more than once"),
         (
             [RUN, "beta=[-2,-1]", "beta_controller=[mood]"],
-            (
-                [RUN, "beta=[-2,-1]", "beta_controller=[mood]"],
-                "beta_controller=['mood'] must be a list of some of clearance, tail_variance, bandit in brackets or null",
-            ),
+            "beta_controller=['mood'] must be a list of some of clearance, tail_variance, bandit in brackets or null",
         ),
         (
             [RUN, "beta=[-2,-1]", "controller.near_m=2"],

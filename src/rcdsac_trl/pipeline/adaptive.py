@@ -1,6 +1,7 @@
 """Beta that is turned at run time, in an evaluation: the same controllers as on a robot, for a whole team."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -11,11 +12,36 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from rcdsac_trl.deploy.adaptive import BanditBeta, BetaController
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.interface import range_distances
 from rcdsac_trl.pipeline.predictions import QuantilePredictor
 
 BANDIT = "bandit"
 """The controller that is played on episodes which were driven, see :func:`play_bandit`."""
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """How controllers turn beta (``controller`` in ``conf/evaluate.yaml``); see :mod:`rcdsac_trl.deploy.adaptive`."""
+
+    near_m: float
+    far_m: float
+    window_steps: int
+    step_size: float
+    exploration: float
+
+    def __post_init__(self) -> None:
+        """Refuse what the controllers would."""
+        if not 0.0 < self.near_m < self.far_m:
+            raise UserInputError(
+                f"controller.near_m={self.near_m:g} must be above 0 and below controller.far_m={self.far_m:g}"
+            )
+        if self.window_steps < 2:
+            raise UserInputError(f"controller.window_steps={self.window_steps} must be at least 2")
+        if self.step_size <= 0:
+            raise UserInputError(f"controller.step_size={self.step_size:g} must be above 0")
+        if not 0.0 <= self.exploration <= 1.0:
+            raise UserInputError(f"controller.exploration={self.exploration:g} must be from 0 to 1")
 
 
 class AdaptivePolicy(TensorDictModuleBase):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.recording import Moment
 from rcdsac_trl.pipeline.video import Frame
 from rcdsac_trl.world.render import (
@@ -36,7 +37,27 @@ _FINE = 2
 _TAIL = 0.1
 
 
+_MOST_FPS = 120
 _LEGEND: dict[str, Color] = {"known to the planner": MAPPED, "only sensed": UNMAPPED, "walking": MOVER, "goal": GOAL}
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """What an evaluation films (``video`` in ``conf/evaluate.yaml``)."""
+
+    map: int
+    episode: int
+    fps: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit."""
+        for key in ("map", "episode"):
+            if (number := getattr(self, key)) < 0:
+                raise UserInputError(f"video.{key}={number} must be at least 0")
+        if not 0 < self.fps <= _MOST_FPS:
+            raise UserInputError(
+                f"video.fps={self.fps:g} must be above 0 and at most {_MOST_FPS}: choose such a number"
+            )
 
 
 @dataclass(frozen=True)

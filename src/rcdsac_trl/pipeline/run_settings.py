@@ -11,13 +11,13 @@ from typing import Literal
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.pipeline.adaptive import ControllerSettings
 from rcdsac_trl.pipeline.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.pipeline.drivers import resolve_processes
+from rcdsac_trl.pipeline.film import VideoSettings
 from rcdsac_trl.pipeline.settings import AlgoSettings, LearnerSettings, Schedule, WorldSettings
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.task import TaskSettings
-
-_MOST_FPS = 120
 
 Threads = int | Literal["auto"]
 Workers = int | Literal["auto"]
@@ -177,47 +177,6 @@ class ExportSettings:
         if self.run is None:
             raise UserInputError("name what to export: run=<folder>")
         _check_least("num_quantiles", self.num_quantiles, 1)
-
-
-@dataclass(frozen=True)
-class VideoSettings:
-    """What an evaluation films (``video`` in ``conf/evaluate.yaml``)."""
-
-    map: int
-    episode: int
-    fps: float
-
-    def __post_init__(self) -> None:
-        """Refuse what is below its limit."""
-        for key in ("map", "episode"):
-            _check_least(f"video.{key}", getattr(self, key), 0)
-        if not 0 < self.fps <= _MOST_FPS:
-            raise UserInputError(
-                f"video.fps={self.fps:g} must be above 0 and at most {_MOST_FPS}: choose such a number"
-            )
-
-
-@dataclass(frozen=True)
-class ControllerSettings:
-    """How controllers turn beta (``controller`` in ``conf/evaluate.yaml``); see :mod:`rcdsac_trl.deploy.adaptive`."""
-
-    near_m: float
-    far_m: float
-    window_steps: int
-    step_size: float
-    exploration: float
-
-    def __post_init__(self) -> None:
-        """Refuse what the controllers would."""
-        if not 0.0 < self.near_m < self.far_m:
-            raise UserInputError(
-                f"controller.near_m={self.near_m:g} must be above 0 and below controller.far_m={self.far_m:g}"
-            )
-        _check_least("controller.window_steps", self.window_steps, 2)
-        if self.step_size <= 0:
-            raise UserInputError(f"controller.step_size={self.step_size:g} must be above 0")
-        if not 0.0 <= self.exploration <= 1.0:
-            raise UserInputError(f"controller.exploration={self.exploration:g} must be from 0 to 1")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from rcdsac_trl.deploy.adaptive import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.pipeline import runtime
-from rcdsac_trl.pipeline.adaptive import AdaptivePolicy
+from rcdsac_trl.pipeline.adaptive import AdaptivePolicy, ControllerSettings
 from rcdsac_trl.pipeline.build.agent import make_actor, make_policy, unpacked_loss
 from rcdsac_trl.pipeline.build.world import evaluation_team
 from rcdsac_trl.pipeline.drivers import Drive, Rows
@@ -23,7 +23,7 @@ from rcdsac_trl.pipeline.evaluation import measure_map
 from rcdsac_trl.pipeline.metrics import Condition
 from rcdsac_trl.pipeline.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.pipeline.predictions import QuantilePredictor
-from rcdsac_trl.pipeline.run_settings import ControllerSettings, TrainingSettings
+from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import WorldSettings
 from rcdsac_trl.pipeline.teams import Team
 from rcdsac_trl.pipeline.trips import trip_metrics

@@ -9,11 +9,10 @@ from tqdm import tqdm
 from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.pipeline.build.agent import unpacked_loss
 from rcdsac_trl.pipeline.build.driver import Agent, Course, driver
-from rcdsac_trl.pipeline.film import Track, film
+from rcdsac_trl.pipeline.film import Track, VideoSettings, film
 from rcdsac_trl.pipeline.interrupts import interruption_point
 from rcdsac_trl.pipeline.predictions import QuantilePredictor
 from rcdsac_trl.pipeline.recording import Moment, Recorder
-from rcdsac_trl.pipeline.run_settings import VideoSettings
 from rcdsac_trl.pipeline.teams import Team
 from rcdsac_trl.pipeline.video import write_video
 from rcdsac_trl.world.episode import draw_motor_steps
