@@ -29,8 +29,8 @@ _GATHERED_FOR_M = 1.0
 class Lens:
     """What all depth cameras of a rig have in common; every field is a key of ``camera`` in ``conf/course.yaml``.
 
-    A pinhole camera with square pixels, counted from 0: its focal length is ``width_px / (2 tan(view_deg / 2))`` pixels,
-    its principal point ``(width_px / 2, height_px / 2 - 1)``.
+    A pinhole camera with square pixels, counted from 0: its focal length is ``width_px / (2 tan(view_deg / 2))``
+    pixels, its principal point ``(width_px / 2, height_px / 2 - 1)``.
 
     Attributes:
         width_px: pixels in a row.
@@ -77,7 +77,7 @@ class Lens:
         return self.width_px / (2.0 * math.tan(math.radians(self.view_deg) / 2.0))
 
     def directions(self) -> NDArray[np.float64]:
-        """Return the points of all pixels at depth 1 m, optical frame (x right, y down, z ahead), [height, width, 3]."""
+        """Return the points of all pixels at depth 1 m in the optical frame (x right, y down), [height, width, 3]."""
         # The rasteriser looks through a pixel's corner (the lower left one), not through its middle.
         x = (np.arange(self.width_px) - self.width_px / 2.0) / self.focal_px
         y = (np.arange(self.height_px) + 1.0 - self.height_px / 2.0) / self.focal_px
@@ -189,7 +189,7 @@ class DepthCameras:
         pybullet.resetSimulation(physicsClientId=self._client)
         self._gathered_at = xy
         apart = np.hypot(*(self._centres - xy).T) - self._radii
-        seen = [self._solids[k] for k in np.flatnonzero(apart < self._reach_m + _GATHERED_FOR_M)]
+        seen = [self._solids[k] for k in np.flatnonzero(apart < self._reach_m + _GATHERED_FOR_M).tolist()]
         standing = [Solid(Box(*xy, _FLOOR_M, _FLOOR_M, 0.0, mapped=True), -0.1, 0.0), *seen]
         for first in range(0, len(standing), _SHAPES_PER_BODY):
             self._add(standing[first : first + _SHAPES_PER_BODY])

@@ -40,10 +40,12 @@ class Piece:
     Attributes:
         footprint: what the robot cannot enter; says, too, whether the planner knows the piece.
         solids: what depth cameras see; none for a pane without a frame.
+        glass: whether it covers more than its solids do.
     """
 
     footprint: Box | Cylinder
     solids: tuple[Solid, ...]
+    glass: bool = False
 
 
 def wall(x0: float, y0: float, x1: float, y1: float) -> Piece:
@@ -75,7 +77,7 @@ def glass(x0: float, y0: float, x1: float, y1: float, framed: bool = True) -> Pi
     """Return a glass wall: the planner knows it, cameras see its frame alone, and nothing of one without."""
     box = _along(x0, y0, x1, y1, GLASS_M)
     if not framed:
-        return Piece(box, ())
+        return Piece(box, (), glass=True)
     half = GLASS_M / 2.0
     spans = max(1, round(math.hypot(x1 - x0, y1 - y0) / POST_EVERY_M))
     # The outermost posts stand within the pane's ends.
@@ -84,7 +86,8 @@ def glass(x0: float, y0: float, x1: float, y1: float, framed: bool = True) -> Pi
     posts = [
         Box(x0 + (x1 - x0) * part, y0 + (y1 - y0) * part, half, half, 0.0, mapped=True, wall=True) for part in share
     ]
-    return Piece(box, (Solid(box, 0.0, RAIL_M), *(Solid(post, 0.0, WALL_HEIGHT_M) for post in posts)))
+    solids = (Solid(box, 0.0, RAIL_M), *(Solid(post, 0.0, WALL_HEIGHT_M) for post in posts))
+    return Piece(box, solids, glass=True)
 
 
 def desk(x: float, y: float, yaw_deg: float = 0.0, length_m: float = 1.6, depth_m: float = 0.8) -> Piece:

@@ -5,6 +5,7 @@ with rooms between them, doors of 1 m, desks that the planner knows, and chairs,
 people that it does not. Some walls are glass (:func:`rcdsac_trl.world.furniture.glass`).
 """
 
+import itertools
 from dataclasses import dataclass
 from functools import cache
 
@@ -60,14 +61,19 @@ class Office:
     Attributes:
         map: footprints and who walks there; for the physics, the planner and the exact range sensor.
         planner: of the map; knows what is mapped.
-        solids: what depth cameras see, people aside.
+        pieces: all that stands.
         course: corner points of the course, the start first, float64 [k, 2], m.
     """
 
     map: Map
     planner: Planner
-    solids: tuple[Solid, ...]
+    pieces: tuple[Piece, ...]
     course: NDArray[np.float64]
+
+    @property
+    def solids(self) -> tuple[Solid, ...]:
+        """What depth cameras see, people aside."""
+        return tuple(solid for piece in self.pieces for solid in piece.solids)
 
 
 @cache
@@ -79,7 +85,7 @@ def make_office() -> Office:
         >>> round(polyline_m(office.course), 9)
         53.7
     """
-    pieces = [*_building(), *_open_plan(), *_rooms(), *_lounge()]
+    pieces = (*_building(), *_open_plan(), *_rooms(), *_lounge())
     footprints = [piece.footprint for piece in pieces]
     map_ = Map(
         layout="office",
@@ -91,7 +97,7 @@ def make_office() -> Office:
     planner = Planner(map_)
     course = _cut(_planned(planner, _STATIONS), COURSE_M)
     course.flags.writeable = False
-    return Office(map_, planner, tuple(solid for piece in pieces for solid in piece.solids), course)
+    return Office(map_, planner, pieces, course)
 
 
 def polyline_m(points: NDArray[np.float64]) -> float:
@@ -102,7 +108,7 @@ def polyline_m(points: NDArray[np.float64]) -> float:
 def _planned(planner: Planner, stations: tuple[tuple[float, float], ...]) -> NDArray[np.float64]:
     """Return the corner points from station to station, the first included."""
     points = [np.array([stations[0]])]
-    for start, goal in zip(stations, stations[1:], strict=False):
+    for start, goal in itertools.pairwise(stations):
         points.append(planner.waypoints(start, goal))
     return np.concatenate(points)
 
@@ -177,7 +183,12 @@ def _rooms() -> list[Piece]:
     """Both corridors and the rooms between them."""
     meeting = [desk(2.9, 10.7, 0.0, 2.8, 1.2), *(chair(x, 9.6, 90.0) for x in (2.0, 2.9)), chair(3.8, 9.45, 80.0)]
     meeting += [*(chair(x, 11.8, 270.0) for x in (2.0, 2.9, 3.8)), open_door(5.2, 8.4, 80.0)]
-    kitchen = [block(8.25, 12.6, 3.4, 0.6, 0.9, mapped=True), round_table(9.6, 10.4), stool(9.2, 9.8), stool(10.1, 10.1)]
+    kitchen = [
+        block(8.25, 12.6, 3.4, 0.6, 0.9, mapped=True),
+        round_table(9.6, 10.4),
+        stool(9.2, 9.8),
+        stool(10.1, 10.1),
+    ]
     passed = [
         desk(11.35, 11.9, 90.0),
         chair(12.1, 11.8, 185.0),

@@ -1,6 +1,7 @@
 """From the config to objects: the only package that reads ``cfg``."""
 
 from rcdsac_trl.pipeline.build.calibration import calibration
+from rcdsac_trl.pipeline.build.course import course
 from rcdsac_trl.pipeline.build.evaluation import evaluation
 from rcdsac_trl.pipeline.build.export import Export, export
 from rcdsac_trl.pipeline.build.resume import run_to_continue
@@ -13,6 +14,7 @@ __all__ = [
     "calibration",
     "check_single",
     "check_training",
+    "course",
     "evaluation",
     "export",
     "failure",

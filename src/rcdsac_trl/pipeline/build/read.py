@@ -13,6 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import choices
+from rcdsac_trl.pipeline.course.settings import CourseSettings
 from rcdsac_trl.pipeline.logs import CONFIG_NAME
 from rcdsac_trl.pipeline.run_settings import (
     CalibrationSettings,
@@ -59,6 +60,15 @@ def calibration_settings(cfg: DictConfig) -> CalibrationSettings:
         UserInputError: for whatever it holds that cannot work.
     """
     return read(CalibrationSettings, _plain(cfg))
+
+
+def course_settings(cfg: DictConfig) -> CourseSettings:
+    """Read the config of a drive over the course.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(CourseSettings, _plain(cfg))
 
 
 def export_settings(cfg: DictConfig) -> ExportSettings:

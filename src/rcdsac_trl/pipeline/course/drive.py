@@ -1,6 +1,7 @@
 """One run over the course: all that the pilot learns comes from four depth cameras and odometry."""
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 from rcdsac_trl.deploy.checks import Stamps
 from rcdsac_trl.deploy.path import PathFollower
 from rcdsac_trl.deploy.policy import Command
-from rcdsac_trl.interface import MOTOR_PERIOD_S
 from rcdsac_trl.pipeline.course.odometry import Odometry, OdometrySettings, Pose
 from rcdsac_trl.pipeline.course.rig import camera_poses, mounted, sectors_of_clouds
 from rcdsac_trl.seeding import stream
@@ -151,7 +151,7 @@ def drive_course(
         simulation.load(office.map, office.planner, pose, stream(conditions.seed, "course/people", *index))
         pilot.reset()
         states = [_state(simulation, odometry, False)]
-        steps: list[tuple[Any, ...]] = []
+        steps: list[dict[str, Any]] = []
         velocity = odometry.velocity(0.0, 0.0)
         while (waypoints := follower.update(odometry.pose)) is not None:
             now_s = len(steps) * PERIOD_S
@@ -162,13 +162,14 @@ def drive_course(
             stamps = Stamps(now_s, now_s, now_s, now_s)
             command = pilot.act(seen, waypoints, velocity, beta, stamps=stamps)
             commanded = (command.v_m_per_s, command.omega_rad_per_s)
-            limited = not command.stopped and command.reason is not None
             moved = simulation.step(*commanded, motor_steps(len(steps)))
-            steps.append((seen.distances_m, velocity, commanded, command.stopped, limited))
+            step = {"distances_m": seen.distances_m, "velocities": velocity, "commands": commanded}
+            limited = not command.stopped and command.reason is not None
+            steps.append(step | {"stopped": command.stopped, "limited": limited})
             odometry.move(moved.pose, PERIOD_S)
             velocity = odometry.velocity(moved.v_c, moved.omega_c)
             states.append(_state(simulation, odometry, moved.in_contact))
-    return _trace(bool(follower.reached), states, steps)
+    return Trace(bool(follower.reached), **_columns(states), **_columns(steps))
 
 
 def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int | bool]:
@@ -179,18 +180,18 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
         course: as it was driven, [k, 2].
 
     Returns:
-        `finished`; `time_s` until the end or the time limit; `collisions`, contacts that began; `contact_fraction` of the
-        steps; `driven_m`; `nearest_m`, smallest true distance from the robot's centre to anything; `stopped_steps` and
-        `limited_steps`, in which the pilot refused to drive, or its limits changed its wish; `goal_error_m`, true distance
-        to the goal at the end; `estimate_error_m`, the largest error of the estimated position.
+        `finished`; `time_s` until the end or the time limit; `collisions`, contacts that began; `contact_fraction` of
+        the steps; `driven_m`; `nearest_m`, smallest true distance from the robot's centre to anything; `stopped_steps`
+        and `limited_steps`, in which the pilot refused to drive, or its limits changed its wish; `goal_error_m`, true
+        distance to the goal at the end; `estimate_error_m`, the largest error of the estimated position.
     """
     contacts = trace.in_contact.tolist()
-    onsets = (collision_due(now, before, "onset") for before, now in zip(contacts, contacts[1:], strict=False))
+    onsets = (collision_due(now, before, "onset") for before, now in itertools.pairwise(contacts))
     return {
         "finished": trace.finished,
         "time_s": len(trace.commands) * PERIOD_S,
         "collisions": sum(onsets),
-        "contact_fraction": float(trace.in_contact[1:].mean()) if len(trace.commands) else 0.0,
+        "contact_fraction": float(trace.in_contact[1:].mean()),
         "driven_m": float(np.hypot(*np.diff(trace.poses[:, :2], axis=0).T).sum()),
         "nearest_m": float(trace.nearest_m.min()),
         "stopped_steps": int(trace.stopped.sum()),
@@ -200,19 +201,16 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
     }
 
 
-def _state(simulation: Simulation, odometry: Odometry, in_contact: bool) -> tuple[Any, ...]:
-    nearest_m = float(simulation.scan().min())
-    return simulation.pose, odometry.pose, simulation.mover_positions, in_contact, nearest_m
+def _state(simulation: Simulation, odometry: Odometry, in_contact: bool) -> dict[str, Any]:
+    return {
+        "poses": simulation.pose,
+        "estimates": odometry.pose,
+        "people": simulation.mover_positions,
+        "in_contact": in_contact,
+        "nearest_m": simulation.scan().min(),
+    }
 
 
-def _trace(finished: bool, states: list[tuple[Any, ...]], steps: list[tuple[Any, ...]]) -> Trace:
-    distances, velocities, commands, stopped, limited = zip(*steps, strict=True) if steps else ((),) * 5
-    return Trace(
-        finished,
-        *(np.array(column) for column in zip(*states, strict=True)),
-        distances_m=np.array(distances),
-        velocities=np.array(velocities),
-        commands=np.array(commands),
-        stopped=np.array(stopped, dtype=np.bool_),
-        limited=np.array(limited, dtype=np.bool_),
-    )
+def _columns(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+    """Stack rows that have the same keys."""
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}

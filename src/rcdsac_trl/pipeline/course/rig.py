@@ -54,6 +54,13 @@ def sectors_of_clouds(clouds: NDArray[np.float64], poses: tuple[CameraPose, ...]
     return cloud_sectors(list(zip(clouds, poses, strict=True)), FILTER)
 
 
+def covered(poses: tuple[CameraPose, ...]) -> NDArray[np.bool_]:
+    """Return the sectors that the cameras have in view out to 3 m, bool [180]."""
+    # One far point a camera stands for a cloud in which nothing is near: what is covered follows from the poses.
+    far = np.full((FILTER.min_points, 3), 100.0)
+    return cloud_sectors([(far, pose) for pose in poses], FILTER).covered
+
+
 def _looking(yaw: float, pitch: float) -> tuple[float, float, float, float]:
     """Return the quaternion (x, y, z, w) of a frame turned left by yaw and then down by pitch."""
     sin_y, cos_y, sin_p, cos_p = math.sin(yaw / 2), math.cos(yaw / 2), math.sin(pitch / 2), math.cos(pitch / 2)
