@@ -155,13 +155,13 @@ def _open_plan() -> list[Piece]:
     islands = [desk(x, y) for x in (4.3, 9.4, 14.4) for y in (3.65, 4.45)]
     chairs = [
         chair(2.1, 1.25, 270.0),
-        chair(4.9, 1.5, 240.0),
+        chair(4.9, 1.3, 240.0),
         chair(7.2, 1.3, 280.0),
-        chair(9.2, 1.4, 225.0),
+        chair(9.2, 1.25, 225.0),
         chair(12.0, 1.35, 265.0),
         chair(14.1, 1.25, 270.0),
         chair(4.1, 2.85, 75.0),
-        chair(9.7, 2.75, 110.0),
+        chair(9.7, 2.95, 110.0),
         chair(14.2, 2.95, 90.0),
         chair(4.5, 5.3, 285.0),
         chair(9.2, 5.2, 260.0),
@@ -217,12 +217,12 @@ def _lounge() -> list[Piece]:
     sofas = [block(6.0, 19.4, 2.2, 0.8, 0.75, mapped=True), block(9.4, 19.4, 2.2, 0.8, 0.75, mapped=True)]
     tables = [round_table(5.3, 17.0), round_table(8.3, 16.3), round_table(7.6, 18.2), round_table(13.2, 17.6)]
     stools = [
-        stool(4.7, 16.3),
+        stool(4.6, 16.5),
         stool(6.0, 17.7),
         stool(8.9, 17.1),
-        stool(10.4, 16.8),
+        stool(10.2, 16.6),
         stool(12.4, 17.1),
         stool(13.9, 16.9),
     ]
-    things = [round_block(4.2, 15.3, 0.22, 0.9), pole(3.6, 17.6), round_block(11.3, 16.0, 0.15, 0.35)]
+    things = [round_block(4.4, 15.05, 0.2, 0.9), pole(3.6, 17.6), round_block(11.3, 16.0, 0.15, 0.35)]
     return [*sofas, *tables, *stools, *things]

@@ -17,6 +17,7 @@ class CourseSettings:
     run: str | tuple[str, ...] | None
     beta: tuple[float, ...] | None
     baseline: Literal["pursuit"] | None
+    guard: bool
     repetitions: int
     seed: int
     time_limit_s: float
