@@ -56,7 +56,17 @@ def test_commands_are_accepted(verb: str, arguments: str, monkeypatch: pytest.Mo
 
 def test_there_are_commands_of_every_verb() -> None:
     verbs = {text.split()[0] for _, text in texts(r"python -m rcdsac_trl\.(\w+ [^\n`]+)")}
-    assert verbs == {"train", "evaluate", "calibrate", "report", "export", "plot_training", "draw_maps", "search"}
+    assert verbs == {
+        "train",
+        "evaluate",
+        "calibrate",
+        "report",
+        "export",
+        "plot_training",
+        "draw_maps",
+        "search",
+        "course",
+    }
 
 
 @pytest.mark.parametrize(("name", "target"), texts(r"\]\((?!https?:)([^)#]+)"))

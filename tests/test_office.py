@@ -147,17 +147,18 @@ def test_the_cameras_cover_the_narrow_sensor() -> None:
 
 
 def test_the_cameras_agree_with_the_exact_sensor_where_there_is_no_glass() -> None:
-    """Never nearer than 5 mm, since nothing else is there; farther by less than a pixel's width of an edge."""
+    """Never nearer by more than 5 mm; farther at edges that pixels miss, and some edges far off are not seen at all."""
     segments, circles = OFFICE.map.segments(), OFFICE.map.circles()
     rng = np.random.default_rng(3)
     poses = camera_poses(EXACT.view_deg)
     off, unseen, sensed = [], 0, 0
     with cameras(EXACT, OFFICE.solids) as made:
-        for _ in range(40):
-            x, y = rng.uniform((0.6, 0.6), (19.4, 5.8))  # open plan: desks, chairs, a door, no glass
-            exact = sector_distances(x, y, yaw := rng.uniform(-3.0, 3.0), segments, circles)[NARROW]
-            if exact.min() < 0.3:
+        for _ in range(60):
+            x, y = OFFICE.planner.sample_free(rng)
+            if y > 5.8:  # below is the open plan: desks, chairs, a door, and no glass
                 continue
+            yaw = rng.uniform(-3.0, 3.0)
+            exact = sector_distances(x, y, yaw, segments, circles)[NARROW]
             seen = sectors_of_clouds(made.clouds((x, y, yaw), NOBODY), poses).distances_m[NARROW]
             both = np.isfinite(seen) & (exact < 2.9)
             off += (seen[both] - exact[both]).tolist()
@@ -168,7 +169,7 @@ def test_the_cameras_agree_with_the_exact_sensor_where_there_is_no_glass() -> No
     assert errors.min() > -0.005
     assert np.median(errors) < 0.005
     assert np.quantile(errors, 0.9) < 0.1
-    assert unseen / sensed < 0.02
+    assert unseen / sensed < 0.04
 
 
 def test_a_chair_is_seen_by_its_seat_where_its_legs_are_between_the_rays() -> None:

@@ -199,6 +199,7 @@ def test_every_key_of_the_configuration_is_explained() -> None:
         "evaluate.yaml",
         "export.yaml",
         "calibrate.yaml",
+        "course.yaml",
         "report.yaml",
         "draw_maps.yaml",
         "plot_training.yaml",
