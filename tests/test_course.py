@@ -257,7 +257,7 @@ def test_equal_calls_write_equal_files_and_others_another_folder(tmp_path: Path)
     with pytest.raises(UserInputError, match="holds the course of something else"):
         build.course(compose("course", given(tmp_path, run, "repetitions=2")))
     with pytest.raises(UserInputError, match="holds the course of something else"):
-        build.course(compose("course", given(tmp_path, run, "repetitions=1", "guard=false")))
+        build.course(compose("course", given(tmp_path, run, "repetitions=1", "guard_margin_m=null")))
 
 
 @pytest.mark.parametrize(
@@ -295,6 +295,7 @@ def test_agents_drive_at_what_the_paper_drove_them_at(
         ({}, ["camera.view_deg=40"], "of which the four cameras cover"),
         ({}, ["odometry.fix_weight=2"], "odometry.fix_weight=2"),
         ({}, ["out="], "out names no folder"),
+        ({}, ["guard_margin_m=-0.1"], "margin_m=-0.1"),
     ],
 )
 def test_what_cannot_work_is_refused_before_anything_is_written(

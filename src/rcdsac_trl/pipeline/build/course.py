@@ -5,13 +5,12 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
 
 import rcdsac_trl
-from rcdsac_trl.deploy import Policy, shipped_names
+from rcdsac_trl.deploy import Guard, Policy, shipped_names
 from rcdsac_trl.deploy.checks import InputLimits
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.interface import sensor_mask
@@ -55,7 +54,7 @@ def course(cfg: DictConfig) -> CourseRun:
         "entries": [{"run": entry.run, "agent": entry.agent, "beta": entry.beta} for entry in entries],
         "agents": {entry.run: asdict(entry.pilot.config) for entry in entries if isinstance(entry.pilot, Policy)},
         "course_m": COURSE_M,
-        "guard": settings.guard,
+        "guard_margin_m": settings.guard_margin_m,
         "repetitions": settings.repetitions,
         "seed": settings.seed,
         "time_limit_s": settings.time_limit_s,
@@ -82,8 +81,8 @@ def _entries(settings: CourseSettings) -> list[Entry]:
             raise UserInputError(
                 "no agent is shipped with this version: name who drives with run=<folder> or baseline=pursuit"
             )
-    limits: dict[str, Any] = {} if settings.guard else {"guard": None}
-    policies = {run: rcdsac_trl.load(run, **limits) for run in runs}
+    guard = None if settings.guard_margin_m is None else Guard(margin_m=settings.guard_margin_m)
+    policies = {run: rcdsac_trl.load(run, guard=guard) for run in runs}
     for run, policy in policies.items():
         _check_sensor(run, policy, settings.camera.view_deg)
     conditioned = [run for run, policy in policies.items() if policy.config.context == "beta"]
@@ -127,8 +126,8 @@ def _default_out(settings: CourseSettings, entries: Sequence[Entry]) -> Path:
     folder = Path(runs[0]) / "course" if len(runs) == 1 and Path(runs[0]).is_dir() else Path("course")
     told = "" if settings.beta is None else "-beta" + "_".join(f"{beta:g}" for beta in settings.beta)
     who = "" if folder != Path("course") else "-".join(Path(run).name for run in runs) + "-"
-    limits = "" if settings.guard else "-unguarded"
-    return folder / f"{who}seed{settings.seed}-{settings.repetitions}x{told}{limits}"
+    margin = "none" if settings.guard_margin_m is None else f"{settings.guard_margin_m:g}"
+    return folder / f"{who}seed{settings.seed}-{settings.repetitions}x{told}-guard{margin}"
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ class CourseSettings:
     run: str | tuple[str, ...] | None
     beta: tuple[float, ...] | None
     baseline: Literal["pursuit"] | None
-    guard: bool
+    guard_margin_m: float | None
     repetitions: int
     seed: int
     time_limit_s: float
