@@ -202,7 +202,7 @@ def _rooms() -> list[Piece]:
     office = [desk(19.2, 11.0, 90.0), chair(18.4, 11.1, 0.0), block(15.6, 11.0, 1.8, 0.5, 1.3, 90.0, mapped=True)]
     corridors = [
         block(15.2, 6.85, 0.6, 0.4, 0.4, 5.0),
-        chair(14.3, 7.95, 270.0),
+        chair(13.9, 7.97, 270.0),
         pole(10.9, 7.0),
         round_block(11.2, 14.4, 0.2, 0.9),
         block(9.3, 13.35, 1.2, 0.4, 1.1, mapped=True),
