@@ -1,6 +1,6 @@
 """The office, and the course of 53.7 m through it, as in the paper's section "Real-World Experiments".
 
-The paper shows no plan of its office. This one has what the section and its figure speak of: two corridors of 1.6 m
+The paper shows no plan of its office. This one has what the section and its figure speak of: two corridors of 1.7 m
 with rooms between them, doors of 1 m, desks that the planner knows, and chairs, stools, poles, cartons, open doors and
 people that it does not. Some walls are glass (:func:`rcdsac_trl.world.furniture.glass`).
 """
