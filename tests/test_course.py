@@ -229,21 +229,22 @@ def test_the_command_writes_the_paper_s_table_and_a_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = [exported(tmp_path / "pow"), exported(tmp_path / "sac", **SAC)]
-    asked = given(tmp_path, folder_of(runs), "beta=[-2,-1]", "baseline=pursuit", "repetitions=2")
+    asked = given(tmp_path, folder_of(runs), "beta=[-2,-1]", "baseline=pursuit", "repetitions=1")
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else it starts this process again
     monkeypatch.setattr("sys.argv", ["course", *asked])
     importlib.import_module("rcdsac_trl.course").main()
     out = tmp_path / "out"
     names = {"course.json", "course.png", "office.json", "runs.csv", "table.csv", "table.md", "traces.csv"}
     assert {path.name for path in out.iterdir()} == names
     rows = pd.read_csv(out / "runs.csv")
-    assert len(rows) == 4 * 2 * 2
+    assert len(rows) == 4 * 2
     assert rows["agent"].unique().tolist() == ["rcdsac_pow", "sac", "pursuit"]
     assert not rows["finished"].any()
-    table = pd.read_csv(out / "table.csv").fillna("")
+    table = pd.read_csv(out / "table.csv", dtype=str, keep_default_na=False)
     assert table["agent"].tolist() == ["RC-DSAC", "RC-DSAC", "SAC", "pursuit"]
-    assert table["β"].tolist() == [-2, -1, "", ""]
-    assert table["forward time, s, paper"].tolist() == [110, 107, 115, ""]
-    assert set(table["reverse finished"]) == {"0 of 2"}
+    assert table["β"].tolist() == ["-2", "-1", "", ""]
+    assert table["forward time, s, paper"].tolist() == ["110", "107", "115", ""]
+    assert set(table["reverse finished"]) == {"0 of 1"}
     assert set(table["reverse time, s"]) == {""}
     traces = pd.read_csv(out / "traces.csv")
     assert len(traces) == len(rows) * 5
