@@ -17,12 +17,12 @@ from rcdsac_trl.interface import sensor_mask
 from rcdsac_trl.pipeline import logs, resources, runtime
 from rcdsac_trl.pipeline.build.read import course_settings
 from rcdsac_trl.pipeline.course.drive import Conditions, drive_course
-from rcdsac_trl.pipeline.course.film import check_extra
 from rcdsac_trl.pipeline.course.pursuit import PursuitPilot
 from rcdsac_trl.pipeline.course.rig import camera_poses, covered
 from rcdsac_trl.pipeline.course.run import CourseRun, Entry, Job, jobs_of
 from rcdsac_trl.pipeline.course.settings import CourseSettings
 from rcdsac_trl.pipeline.drivers import Drive, Rows, drive_maps, resolve_processes
+from rcdsac_trl.pipeline.video import check_extra
 from rcdsac_trl.world.office import COURSE_M, make_office
 from rcdsac_trl.world.simulation import SIMULATION_BYTES
 

@@ -11,9 +11,10 @@ import pandas as pd
 from tqdm import tqdm
 
 from rcdsac_trl.pipeline.course.drive import DIRECTIONS, PERIOD_S, Direction, Pilot, Trace, course_of, measures
-from rcdsac_trl.pipeline.course.film import frames, write_film
+from rcdsac_trl.pipeline.course.film import FPS, frames
 from rcdsac_trl.pipeline.drivers import Rows
 from rcdsac_trl.pipeline.results import ResultsFolder
+from rcdsac_trl.pipeline.video import write_video
 from rcdsac_trl.world.office import Office, make_office
 from rcdsac_trl.world.shapes import Box
 
@@ -135,7 +136,7 @@ class CourseRun:
         course = course_of(office, job.direction)
         title = f"{entry.name}, {job.direction}{'' if trace.finished else ', not finished'}"
         stem = f"{job.entry}-{entry.name}-{job.direction}".replace(" ", "-")
-        write_film(frames(office, entry.pilot, trace, course, title), self.results.path / stem)
+        write_video(frames(office, entry.pilot, trace, course, title), self.results.path / stem, FPS)
 
 
 def plan_of(office: Office) -> str:
