@@ -104,7 +104,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
             f"  {result['gflop_per_update']:.1f} GFLOP an update: {100 * result['gemm_fraction']:.0f} % of the "
             f"{result['gemm_peak_gflops']:.0f} GFLOP/s of a large matrix product",
         ]
-        lines += [f"  {part:<28} {ms:8.1f} ms" for part, ms in result["milliseconds_by_part"].items()]
+        lines += [f"  {part:<28} {ms:8.1f} ms on one thread" for part, ms in result["milliseconds_by_part"].items()]
     return "\n".join(lines)
 
 
@@ -150,11 +150,18 @@ def play(name: str, overrides: list[str]) -> None:
         "allocator": runtime.allocator(),
         "torch": torch.__version__,
     }
+
+    def on_one_thread(call: Callable[[], Any]) -> Any:
+        torch.set_num_threads(1)
+        result = call()
+        torch.set_num_threads(threads)
+        return result
+
     answers: dict[str, Callable[[int], Any]] = {
         "updates": lambda number: number * seconds(learner.update, number),
         "peak": lambda _: gemm_peak(),
-        "flops": lambda _: count_flops(learner.update),
-        "parts": lambda number: time_parts(learner, number),
+        "flops": lambda _: on_one_thread(lambda: count_flops(learner.update)),
+        "parts": lambda number: on_one_thread(lambda: time_parts(learner, number)),
         "facts": lambda _: facts,
     }
     for line in sys.stdin:
@@ -163,7 +170,10 @@ def play(name: str, overrides: list[str]) -> None:
 
 
 def count_flops(call: Callable[[], Any]) -> int:
-    """Count the floating-point operations of all matrix products and convolutions in a call; nothing else counts."""
+    """Count the floating-point operations of all matrix products and convolutions in a call; nothing else counts.
+
+    What the call does on threads of its own is not seen.
+    """
     import torch
     from torch.utils._python_dispatch import TorchDispatchMode
     from torch.utils.flop_counter import addmm_flop, flop_registry
@@ -186,7 +196,7 @@ def count_flops(call: Callable[[], Any]) -> int:
 
 
 def time_parts(learner: Any, updates: int) -> dict[str, float]:
-    """Return the milliseconds an update spends in every part, backward passes included.
+    """Return the milliseconds an update on one thread spends in every part, backward passes included.
 
     A backward pass reaches all heads before the first encoder: the moment it reaches a memory divides it. The
     learner is of no use for anything else afterwards.

@@ -358,7 +358,7 @@ def test_no_bootstrap_beyond_termination() -> None:
     batch = make_batch(beta=-1.0)
     batch["next", "terminated"][:] = True
     loss = make_loss(num_target_quantiles=5)
-    target = loss.compute_target(batch, loss.encode_actor(batch))
+    target = loss.compute_target(batch, loss.encode_actor(batch), loss.draw(batch))
     torch.testing.assert_close(target, batch["next", "reward"][:, :-1].expand(3, 4, 5))
 
 
@@ -375,8 +375,8 @@ def test_a_constant_beta_collapses_to_the_same_losses() -> None:
 def test_fractions_per_transition_and_per_sequence() -> None:
     shapes = {}
     for per in ("sequence", "transition"):
-        loss = make_loss(fractions_per=per)
-        fractions = loss._fractions(7, torch.zeros(3, 4))
+        loss = make_loss(fractions_per=per, num_quantiles=7)
+        fractions = loss.draw(make_batch()).tau
         assert fractions is not None
         shapes[per] = fractions.shape
         assert torch.isfinite(loss(make_batch())["loss_qvalue"])
@@ -515,7 +515,7 @@ def test_targets_come_from_the_target_parameters(
 
     def target() -> Tensor:
         loss.rng_state = torch.Generator().manual_seed(3).get_state()
-        return loss.compute_target(batch, loss.encode_actor(batch))
+        return loss.compute_target(batch, loss.encode_actor(batch), loss.draw(batch))
 
     before = target()
     for parameter in loss.critic_network_params.parameters():

@@ -5,18 +5,20 @@ Public names::
     LinkedLoss                     LossModule with an actor, critics, target critics and a generator
         ._link_networks(actor, critics)      makes them functional; the subclass calls it once
         .rng_state                           get and set; also in state_dict
-    frozen(parameters)             context: no gradient flows to them
+        .make_value_estimator(gamma=0.99)    .in_keys    .out_keys
 """
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictParams, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
+from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
 
 class LinkedLoss(LossModule):
@@ -26,6 +28,29 @@ class LinkedLoss(LossModule):
     some of their layers.
     """
 
+    @dataclass
+    class _AcceptedKeys:
+        """Default keys of the input.
+
+        Attributes:
+            action: the action taken, ``[B, L+1, A]``.
+            risk: the risk-measure parameter beta, ``[B, L+1, 1]``.
+            tau: under which quantile critics read their fractions.
+            reward: below ``"next"``, ``[B, L+1, 1]``.
+            terminated: below ``"next"``, ``[B, L+1, 1]`` bool.
+        """
+
+        action: NestedKey = "action"
+        risk: NestedKey = "risk"
+        tau: NestedKey = "tau"
+        reward: NestedKey = "reward"
+        terminated: NestedKey = "terminated"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
+
     actor_network: TensorDictSequential
     critic_network: nn.ModuleList
     actor_network_params: TensorDictParams
@@ -33,18 +58,69 @@ class LinkedLoss(LossModule):
     target_actor_network_params: TensorDictParams
     target_critic_network_params: TensorDictParams
 
-    _critics: tuple[TensorDictSequential, ...]
+    log_alpha: nn.Parameter
     _generator: torch.Generator
 
+    #: The parameters that each loss trains.
+    _trained: dict[str, list[nn.Parameter]]
+
     def _link_networks(self, actor: TensorDictSequential, critics: Sequence[TensorDictSequential]) -> None:
-        """Make the networks functional, with target critics, and link them; ``_critics`` holds the critics already."""
+        """Make the networks functional, with target critics, and link them."""
         self.convert_to_functional(actor, "actor_network")
         # One functional module for all critics: their parameters keep apart (a list given to TorchRL's own
         # conversion is stacked, which a recurrent layer without vmap cannot use).
         self.convert_to_functional(nn.ModuleList(critics), "critic_network", create_target_params=True)
-        # In a tuple, so that their parameters are not listed as this module's own a second time.
+        # In tuples, so that their parameters are not listed as this module's own a second time.
+        self._critics = tuple(critics)
         self._target_critics = tuple(copy.deepcopy(critic) for critic in critics)
+        self._frozen_critics = tuple(copy.deepcopy(critic) for critic in critics)
         self._link()
+
+    def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> Self:
+        """Set the target's estimator: one-step bootstrapping (TD0) only; ``gamma`` is given here."""
+        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=self.SUPPORTED_VALUE_ESTIMATORS,
+                tensor_keys={"reward": self.tensor_keys.reward, "terminated": self.tensor_keys.terminated},
+                **hyperparams,
+            )
+        return self
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Every key the loss reads from a batch."""
+        keys: dict[NestedKey, None] = dict.fromkeys(self.actor_network[0].in_keys)
+        for critic in self._critics:
+            keys.update(dict.fromkeys(critic[0].in_keys))
+        keys[self.tensor_keys.action] = None
+        if self._distributional:
+            keys[self.tensor_keys.risk] = None
+        for key in (self.tensor_keys.reward, self.tensor_keys.terminated):
+            keys[("next", *key) if isinstance(key, tuple) else ("next", key)] = None
+        return list(keys)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Every key of the output."""
+        keys = ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "td_error", "q_value"]
+        return [*keys, "quantile_spread"] if self._distributional else keys
+
+    @property
+    def critics(self) -> tuple[TensorDictSequential, ...]:
+        """The critics, each an encoder and a head that hold the loss's parameters."""
+        return self._critics
+
+    @property
+    def _distributional(self) -> bool:
+        return self.tensor_keys.tau in self._critics[0][1].in_keys
+
+    @property
+    def alpha(self) -> Tensor:
+        """The temperature, detached."""
+        return self.log_alpha.detach().exp()
 
     @property
     def rng_state(self) -> Tensor:
@@ -66,13 +142,17 @@ class LinkedLoss(LossModule):
     def _link(self) -> None:
         """Let the modules hold the loss's parameters for good, the target critics those of the targets.
 
+        The frozen critics hold the critics' own, but no gradient flows to them.
+
         Whatever makes new tensors calls this again.
         """
         self.actor_network_params.to_module(self.actor_network)
         self.critic_network_params.to_module(self.critic_network)
         params = self._modules["target_critic_network_params"]  # the attribute warns before there is an updater
         params.to_module(nn.ModuleList(self._target_critics))
-        self._head_parameters = tuple(p for critic in self._critics for p in critic[1].parameters() if p.requires_grad)
+        self.critic_network_params.data.to_module(nn.ModuleList(self._frozen_critics))
+        of_actor, of_critics = self.actor_network.parameters(), self.critic_network.parameters()
+        self._trained = {"loss_actor": list(of_actor), "loss_qvalue": list(of_critics), "loss_alpha": [self.log_alpha]}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or cast the parameters, as :meth:`torch.nn.Module.to` does."""
@@ -84,15 +164,3 @@ class LinkedLoss(LossModule):
         """Take the state of a copied or pickled loss."""
         super().__setstate__(state)
         self._link()
-
-
-@contextmanager
-def frozen(parameters: tuple[nn.Parameter, ...]) -> Iterator[None]:
-    """Let no gradient flow to the parameters from what is computed within a block."""
-    for parameter in parameters:
-        parameter.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for parameter in parameters:
-            parameter.requires_grad_(True)

@@ -9,29 +9,26 @@ Public names::
         forward(batch [B, L+1]) -> loss_actor, loss_qvalue, loss_alpha, alpha, entropy, td_error, q_value
                                    (, quantile_spread)
         .make_value_estimator(gamma=0.99)   .set_keys(...)   .rng_state (get and set; also in state_dict)
-        .encode_actor(batch), .compute_target(..), .qvalue_loss(..), .actor_loss(..): the parts of forward
+        .draw(batch), .encode_actor(batch), .compute_target(..), .qvalue_loss(..), .actor_loss(..): what forward does
         SoftUpdate(loss, eps=...) works; parameters: loss.actor_network_params, loss.critic_network_params,
         loss.log_alpha
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
-from torchrl.objectives.utils import (
-    ValueEstimators,
-    _reduce,
-    dispatch_value_estimator,
-    distance_loss,
-)
+from torchrl.objectives.utils import _reduce, distance_loss
+from torchrl.objectives.value.functional import td0_return_estimate
 
+from rcdsac_trl.agent.draws import Draws, draw
 from rcdsac_trl.agent.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
-from rcdsac_trl.agent.linked_loss import LinkedLoss, frozen
+from rcdsac_trl.agent.linked_loss import LinkedLoss
+from rcdsac_trl.agent.parts import cut, in_parts
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
 
 #: What a target can take of the target critics.
@@ -105,29 +102,6 @@ class DistributionalSACLoss(LinkedLoss):
         >>> targets.step()
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """Default keys of the input.
-
-        Attributes:
-            action: the action taken, ``[B, L+1, A]``.
-            risk: the risk-measure parameter beta, ``[B, L+1, 1]``.
-            tau: under which quantile critics read their fractions.
-            reward: below ``"next"``, ``[B, L+1, 1]``.
-            terminated: below ``"next"``, ``[B, L+1, 1]`` bool.
-        """
-
-        action: NestedKey = "action"
-        risk: NestedKey = "risk"
-        tau: NestedKey = "tau"
-        reward: NestedKey = "reward"
-        terminated: NestedKey = "terminated"
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
-    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
-
     def __init__(
         self,
         actor: TensorDictSequential,
@@ -165,12 +139,10 @@ class DistributionalSACLoss(LinkedLoss):
             raise ValueError(f"target_over_critics = {target_over_critics!r} must be one of {', '.join(OVER_CRITICS)}")
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
-        self._critics = tuple(critics)
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
+        self._link_networks(actor, critics)
         if self._distributional and measure is None:
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
-
-        self._link_networks(actor, critics)
-        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
         self.measure = measure or Neutral()
         self.num_quantiles = num_quantiles
         self.num_target_quantiles = num_target_quantiles
@@ -187,55 +159,6 @@ class DistributionalSACLoss(LinkedLoss):
         self.distortion_strength = 1.0
         self._generator = generator or torch.Generator().manual_seed(0)
 
-    # ------------------------------------------------------------------------------------------- TorchRL's idiom
-    def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams: Any
-    ) -> "DistributionalSACLoss":
-        """Set the target's estimator: one-step bootstrapping (TD0) only; ``gamma`` is given here."""
-        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None:
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=self.SUPPORTED_VALUE_ESTIMATORS,
-                tensor_keys={"reward": self.tensor_keys.reward, "terminated": self.tensor_keys.terminated},
-                **hyperparams,
-            )
-        return self
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Every key the loss reads from a batch."""
-        keys: dict[NestedKey, None] = dict.fromkeys(self.actor_network[0].in_keys)
-        for critic in self._critics:
-            keys.update(dict.fromkeys(critic[0].in_keys))
-        keys[self.tensor_keys.action] = None
-        if self._distributional:
-            keys[self.tensor_keys.risk] = None
-        for key in (self.tensor_keys.reward, self.tensor_keys.terminated):
-            keys[("next", *key) if isinstance(key, tuple) else ("next", key)] = None
-        return list(keys)
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Every key of the output."""
-        keys = ["loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "td_error", "q_value"]
-        return [*keys, "quantile_spread"] if self._distributional else keys
-
-    @property
-    def critics(self) -> tuple[TensorDictSequential, ...]:
-        """The critics, each an encoder and a head that hold the loss's parameters."""
-        return self._critics
-
-    @property
-    def _distributional(self) -> bool:
-        return self.tensor_keys.tau in self._critics[0][1].in_keys
-
-    @property
-    def alpha(self) -> Tensor:
-        """The temperature, detached."""
-        return self.log_alpha.detach().exp()
-
     # ------------------------------------------------------------------------------------------- the losses
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the three losses and detached diagnostics of a batch ``[B, L+1]``.
@@ -244,63 +167,79 @@ class DistributionalSACLoss(LinkedLoss):
         nats, ``td_error`` the mean absolute pairwise temporal difference (largest over the critics), ``q_value`` the
         mean prediction and ``quantile_spread`` the standard deviation over a prediction's sampled quantiles.
         """
-        actor_memory = self.encode_actor(tensordict)
-        loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory)
-        loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories)
-        loss_alpha = -self.log_alpha * (log_prob + self.target_entropy)
-        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha}
-        diagnostics |= {"alpha": self.alpha, "entropy": -log_prob}
-        if self.reduction == "none":
-            diagnostics["alpha"] = self.alpha.expand_as(log_prob)
-            return TensorDict(losses | diagnostics, batch_size=log_prob.shape)
-        losses = {key: _reduce(value, self.reduction) for key, value in losses.items()}
-        return TensorDict(losses | {key: value.mean() for key, value in diagnostics.items()})
-
-    def encode_actor(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the actor's memory of every observation, ``[B, L + 1 - burn_in, memory]``.
-
-        Raises:
-            ValueError: if the batch is not ``[B, L+1]`` with ``L`` above the burn-in.
-        """
         if tensordict.ndim != 2 or tensordict.shape[1] < self.burn_in + 2:
             raise ValueError(
                 f"expected a batch [sequences, steps + 1] with more than burn_in = {self.burn_in} steps, "
                 f"got {list(tensordict.shape)}"
             )
+        draws = self.draw(tensordict)
+        if self.reduction == "none":
+            losses, diagnostics = self._losses(tensordict, draws)
+            diagnostics["alpha"] = self.alpha.expand_as(losses["loss_actor"])
+            return TensorDict(losses | diagnostics, batch_size=losses["loss_actor"].shape)
+        parts = cut(*draws.noise.shape[:2])
+        if len(parts) == 1 or not torch.is_grad_enabled() or draws.noise.device.type != "cpu":
+            return TensorDict(self._reduced(tensordict, draws))
+
+        def compute(part: slice) -> dict[str, Tensor]:
+            share = (part.stop - part.start) / len(tensordict)
+            summed = self._trained if self.reduction == "sum" else {}
+            reduced = self._reduced(tensordict[part], draws.rows(part))
+            return {key: value if key in summed else share * value for key, value in reduced.items()}
+
+        return TensorDict(in_parts(compute, self._trained, parts))
+
+    def _losses(self, tensordict: TensorDictBase, draws: Draws) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return the losses and detached diagnostics, ``[B, L - burn_in]`` but for ``alpha``."""
+        actor_memory = self.encode_actor(tensordict)
+        loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory, draws)
+        loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories, draws)
+        loss_alpha = -self.log_alpha * (log_prob + self.target_entropy)
+        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha}
+        return losses, diagnostics | {"alpha": self.alpha, "entropy": -log_prob}
+
+    def _reduced(self, tensordict: TensorDictBase, draws: Draws) -> dict[str, Tensor]:
+        """Return the reduced losses and the diagnostics' means."""
+        losses, diagnostics = self._losses(tensordict, draws)
+        reduced = {key: _reduce(value, self.reduction) for key, value in losses.items()}
+        return reduced | {key: value.mean() for key, value in diagnostics.items()}
+
+    def draw(self, tensordict: TensorDictBase) -> Draws:
+        """Draw all random numbers that a batch ``[B, L+1]`` needs."""
+        numbers = (self.num_target_quantiles, self.num_quantiles, self.num_risk_samples)
+        action = tensordict.get(self.tensor_keys.action)[:, self.burn_in : -1]
+        return draw(action, numbers if self._distributional else None, self.fractions_per, self._generator)
+
+    def encode_actor(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the actor's memory of every observation, ``[B, L + 1 - burn_in, memory]``."""
         return self._encode(self.actor_network, tensordict)
 
-    def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor) -> Tensor:
+    def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor, draws: Draws) -> Tensor:
         """Return the target samples ``[B, L - burn_in, N']`` (scalar critics: N' = 1), without gradient."""
-        batch, risk = self._transitions(tensordict), self._risk(tensordict)
+        risk = self._risk(tensordict)
         with torch.no_grad():
-            action, log_prob = self._act(actor_memory[:, 1:], risk)
-            tau = self._fractions(self.num_target_quantiles, log_prob)
+            action, log_prob = self._act(actor_memory[:, 1:], risk, draws.next_noise)
             _ = self.target_critic_network_params  # TorchRL warns here where nothing updates them
             values = []
             for critic in self._target_critics:
                 memory = self._encode(critic, tensordict)[:, 1:]
-                values.append(self._evaluate(critic, memory, action, tau, risk))
+                values.append(self._evaluate(critic, memory, action, draws.next_tau, risk))
             next_value = OVER_CRITICS[self.target_over_critics](values)
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
-            # The estimator checks shapes strictly, so every target fraction gets its own entry.
-            outcome = TensorDict(batch_size=batch.batch_size)
-            keys = self.value_estimator.tensor_keys
-            terminated = batch.get(("next", self.tensor_keys.terminated)).expand_as(next_value)
-            outcome.set(("next", keys.reward), batch.get(("next", self.tensor_keys.reward)).expand_as(next_value))
-            outcome.set(("next", keys.terminated), terminated)
-            outcome.set(("next", keys.done), terminated)
-            return self.value_estimator.value_estimate(outcome, next_value=next_value)
+            # What TorchRL's estimator calls, with its shapes: every target fraction gets its own entry.
+            reward = self._transitions(tensordict, ("next", self.tensor_keys.reward)).expand_as(next_value)
+            terminated = self._transitions(tensordict, ("next", self.tensor_keys.terminated)).expand_as(next_value)
+            return td0_return_estimate(self.value_estimator.gamma, next_value, reward, terminated)
 
     def qvalue_loss(
-        self, tensordict: TensorDictBase, actor_memory: Tensor
+        self, tensordict: TensorDictBase, actor_memory: Tensor, draws: Draws
     ) -> tuple[Tensor, list[Tensor], dict[str, Tensor]]:
         """Return the critic loss, the critics' memories for :meth:`actor_loss`, and detached diagnostics.
 
         The loss ``[B, L - burn_in]`` is summed over the critics; a memory is ``[B, L - burn_in, memory]``.
         """
-        target = self.compute_target(tensordict, actor_memory)
-        action, risk = self._transitions(tensordict).get(self.tensor_keys.action), self._risk(tensordict)
-        tau = self._fractions(self.num_quantiles, action)
+        target = self.compute_target(tensordict, actor_memory, draws)
+        action, risk, tau = self._transitions(tensordict, self.tensor_keys.action), self._risk(tensordict), draws.tau
         # No transition starts at the last observation.
         memories = [self._encode(critic, tensordict, stop=-1) for critic in self._critics]
         values = [
@@ -314,19 +253,17 @@ class DistributionalSACLoss(LinkedLoss):
         return torch.stack(errors).sum(0), memories, self._diagnose(values, target)
 
     def actor_loss(
-        self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor]
+        self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor], draws: Draws
     ) -> tuple[Tensor, Tensor]:
         """Return the actor loss and the detached log density of its action, both ``[B, L - burn_in]``."""
-        risk = self._risk(tensordict)
-        action, log_prob = self._act(actor_memory[:, :-1], risk)
-        tau = self._fractions(self.num_risk_samples, log_prob)
+        risk, tau = self._risk(tensordict), draws.risk_tau
+        action, log_prob = self._act(actor_memory[:, :-1], risk, draws.noise)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
-        with frozen(self._head_parameters):
-            values = [
-                self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
-                for critic, memory in zip(self._critics, critic_memories, strict=True)
-            ]
+        values = [
+            self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
+            for critic, memory in zip(self._frozen_critics, critic_memories, strict=True)
+        ]
         return self.alpha * log_prob - minimum(values), log_prob.detach()
 
     # ------------------------------------------------------------------------------------------- parts of them
@@ -335,8 +272,8 @@ class DistributionalSACLoss(LinkedLoss):
         (memory,) = call_module(encoder, {key: tensordict.get(key)[:, :stop] for key in encoder.in_keys})
         return memory[:, self.burn_in :]
 
-    def _transitions(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict[:, self.burn_in : -1]
+    def _transitions(self, tensordict: TensorDictBase, key: NestedKey | tuple) -> Tensor:
+        return tensordict.get(unravel_key(key))[:, self.burn_in : -1]
 
     def _risk(self, tensordict: TensorDictBase) -> Tensor | None:
         """Return beta per transition, a time dimension of 1 where it is one value expanded; None for scalar critics.
@@ -345,14 +282,13 @@ class DistributionalSACLoss(LinkedLoss):
         """
         if not self._distributional:
             return None
-        risk = tensordict.get(self.tensor_keys.risk)[:, self.burn_in : -1]
+        risk = self._transitions(tensordict, self.tensor_keys.risk)
         return risk[:, :1] if risk.stride(1) == 0 else risk
 
-    def _act(self, memory: Tensor, risk: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _act(self, memory: Tensor, risk: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor]:
         entries = {self.actor_network[0].out_keys[0]: memory, self.tensor_keys.risk: risk}
         loc, scale = call_module(self.actor_network[1], entries)
-        noise = torch.randn(loc.shape, generator=self._generator, device=self._generator.device)
-        return squash(loc, scale, noise.to(loc))
+        return squash(loc, scale, noise)
 
     def _evaluate(
         self, critic: TensorDictSequential, memory: Tensor, action: Tensor, tau: Tensor | None, risk: Tensor | None
@@ -364,13 +300,6 @@ class DistributionalSACLoss(LinkedLoss):
             self.tensor_keys.risk: risk,
         }
         return call_module(critic[1], entries)[0]
-
-    def _fractions(self, number: int, like: Tensor) -> Tensor | None:
-        """Draw fractions ``[B, L or 1, number]`` for a tensor ``[B, L, ..]``; None for scalar critics."""
-        if not self._distributional:
-            return None
-        shape = (like.shape[0], 1 if self.fractions_per == "sequence" else like.shape[1], number)
-        return torch.rand(shape, generator=self._generator, device=self._generator.device).to(like.device)
 
     def _diagnose(self, values: list[Tensor], target: Tensor) -> dict[str, Tensor]:
         with torch.no_grad():

@@ -1,0 +1,102 @@
+"""Losses and their gradients from parts of a mini-batch, each on a thread of its own.
+
+Torch gives its threads to one operation after another, and what lies between two matrix products runs on one of them.
+Here each thread does the whole work of some sequences, forwards and backwards, and they meet once.
+
+Public names::
+
+    cut(sequences, steps) -> slices         one where parts do not pay
+    in_parts(compute, groups, parts) -> losses and diagnostics
+"""
+
+import functools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+# A smaller part is mostly calls of operations, and Python makes one at a time.
+_TRANSITIONS_PER_PART = 1024
+
+
+def cut(sequences: int, steps: int) -> list[slice]:
+    """Cut a batch into as many parts as torch has threads, fewer where they would be small.
+
+    Args:
+        sequences: of the batch.
+        steps: of a sequence.
+
+    Example:
+        >>> cut(sequences=3, steps=8)
+        [slice(0, 3, None)]
+    """
+    number = max(1, min(torch.get_num_threads(), sequences * steps // _TRANSITIONS_PER_PART, sequences))
+    edges = [sequences * part // number for part in range(number + 1)]
+    return [slice(start, stop) for start, stop in pairwise(edges)]
+
+
+def in_parts(
+    compute: Callable[[slice], dict[str, Tensor]], groups: dict[str, list[nn.Parameter]], parts: list[slice]
+) -> dict[str, Tensor]:
+    """Return the sums of what the parts return; the backward pass of each is done in its thread, too.
+
+    The threads only share what they read, and sums are taken in the parts' order: results do not depend on timing.
+
+    Args:
+        compute: returns a part's contribution to each loss and, without gradient, to each diagnostic; scalars.
+        groups: name of each loss, and all the parameters it has a gradient in.
+        parts: slices of the batch.
+    """
+    parameters = [parameter for group in groups.values() for parameter in group]
+
+    def work(part: slice) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
+        values = compute(part)
+        losses = torch.stack([values[name] for name in groups])
+        gradients = torch.autograd.grad(losses.sum(), parameters, materialize_grads=True)
+        return {name: value.detach() for name, value in values.items()}, gradients
+
+    pool = _pool(len(parts), max(1, torch.get_num_threads() // len(parts)))
+    running = [pool.submit(work, part) for part in parts]
+    wait(running)  # where one fails nothing of the others goes on
+    (values, gradients), *others = (future.result() for future in running)
+    for more_values, more_gradients in others:
+        values = {name: value + more_values[name] for name, value in values.items()}
+        gradients = torch._foreach_add(gradients, more_gradients)
+    losses = _Known.apply([values[name] for name in groups], list(map(len, groups.values())), gradients, *parameters)
+    return values | dict(zip(groups, losses, strict=True))
+
+
+@functools.cache
+def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
+    """Return workers each of which lets torch use so many threads for an operation."""
+
+    def begin() -> None:
+        torch.set_num_threads(threads)
+
+    return ThreadPoolExecutor(workers, "part", begin)
+
+
+# A forked process has none of its parent's threads.
+os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+class _Known(torch.autograd.Function):
+    """Losses whose gradients are known."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, losses: list[Tensor], sizes: list[int], gradients: tuple[Tensor, ...], *_: nn.Parameter
+    ) -> tuple[Tensor, ...]:
+        ctx.sizes, ctx.gradients = sizes, gradients
+        return tuple(losses)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        each = (slope for slope, size in zip(slopes, ctx.sizes, strict=True) for _ in range(size))
+        return None, None, None, *(gradient * slope for gradient, slope in zip(ctx.gradients, each, strict=True))
