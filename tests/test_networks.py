@@ -43,7 +43,7 @@ def observations(*lead: int) -> TensorDict:
 
 def gradients(output: Tensor, inputs: list[Tensor]) -> list[Tensor]:
     weights = torch.linspace(-1.0, 1.0, output.numel(), dtype=output.dtype).view_as(output)
-    return list(torch.autograd.grad((output * weights).sum(), inputs))
+    return list(torch.autograd.grad((output * weights).sum(), inputs, retain_graph=True))
 
 
 # ------------------------------------------------------------------------------------------------ kernels
@@ -108,12 +108,15 @@ def quantile_head(steps: int, tau_steps: int, risk_steps: int, *, frozen: bool) 
 @pytest.mark.parametrize("frozen", [True, False])
 def test_quantile_values_equal_the_layers(steps: int, tau_shared: bool, risk_shared: bool, frozen: bool) -> None:
     head, (x, tau, beta) = quantile_head(steps, 1 if tau_shared else steps, 1 if risk_shared else steps, frozen=frozen)
-    layers = (head.gate_tau, head.hidden, head.output)
+    layers = (head.gate_tau.weight, head.hidden, head.output)
     fast = quantile_kernels.quantile_values(x, tau, beta, head.cosines.frequencies, *layers)
     plain = head.layers(x, tau, beta)
     torch.testing.assert_close(fast, plain)
-    inputs = [x] if frozen else [x, beta, *(p for layer in layers for p in layer.parameters())]
+    parameters = [head.gate_tau.weight, *head.hidden.parameters(), *head.output.parameters()]
+    inputs = [x] if frozen else [x, beta, *parameters]
     torch.testing.assert_close(gradients(fast, inputs), gradients(plain, inputs))
+    chosen = torch.rand(*fast.shape[:2], 1) < 0.5  # as where the smaller of two critics counts
+    torch.testing.assert_close(gradients(fast * chosen, inputs), gradients(plain * chosen, inputs))
     with torch.no_grad():
         torch.testing.assert_close(
             quantile_kernels.quantile_values(x, tau, beta, head.cosines.frequencies, *layers), plain
@@ -123,7 +126,8 @@ def test_quantile_values_equal_the_layers(steps: int, tau_shared: bool, risk_sha
 @pytest.mark.parametrize("risk_steps", [1, 2])
 def test_quantile_values_against_finite_differences(risk_steps: int) -> None:
     head, (x, tau, beta) = quantile_head(2, 1, risk_steps, frozen=False)
-    parameters = [p for layer in (head.gate_tau, head.hidden, head.output) for p in layer.parameters()]
+    layers = (head.hidden, head.output)
+    parameters = [head.gate_tau.weight, *(p for layer in layers for p in layer.parameters())]
     inputs = (x[:2].detach().requires_grad_(), tau[:2], beta[:2].detach().requires_grad_(), head.cosines.frequencies)
     assert torch.autograd.gradcheck(quantile_kernels._QuantileValues.apply, (*inputs, *parameters))
 

@@ -255,18 +255,18 @@ class QuantileHead(nn.Module):
         """
         x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
         if self.measure is None:
-            beta = x.new_zeros(len(x), 1, x.shape[-1])
+            beta = self.gate_tau.bias.expand(len(x), 1, -1)
         elif risk is None:
             raise ValueError("this critic is conditioned on risk: pass it")
         else:
-            beta = self.gate_beta(self.cosines(self.measure.embed(risk).squeeze(-1)))
+            beta = self.gate_beta(self.cosines(self.measure.embed(risk).squeeze(-1))) + self.gate_tau.bias
         if not _runs_kernels(x):
             return self.layers(x, tau, beta)
-        return quantile_values(x, tau, beta, self.cosines.frequencies, self.gate_tau, self.hidden, self.output)
+        return quantile_values(x, tau, beta, self.cosines.frequencies, self.gate_tau.weight, self.hidden, self.output)
 
     def layers(self, x: Tensor, tau: Tensor, beta: Tensor) -> Tensor:
-        """Compute features ``[B, L, H]`` and beta's part of the gate to quantiles, with the layers one by one."""
-        gate = F.relu(self.gate_tau(self.cosines(tau)) + beta.unsqueeze(2))
+        """Compute features ``[B, L, H]`` and beta's part of the gate, with the bias, to quantiles layer by layer."""
+        gate = F.relu(F.linear(self.cosines(tau), self.gate_tau.weight) + beta.unsqueeze(2))
         return self.output(F.relu(self.hidden(x.unsqueeze(2) * gate))).squeeze(-1)
 
 

@@ -7,10 +7,11 @@ cache; the products are torch's matrix products, and what lies between two of th
 
 Public names::
 
-    quantile_values(x [B,L,H], tau [B,L|1,N], beta [B,L|1,H], frequencies [C], gate, hidden, output) -> [B,L,N]
+    quantile_values(x [B,L,H], tau [B,L|1,N], beta [B,L|1,H], frequencies [C], gate [H,C], hidden, output) -> [B,L,N]
     quantile_huber(quantiles [..,N], targets [..,N'], tau [..,N], kappa) -> [..]
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -55,39 +56,51 @@ def _output(hidden: np.ndarray, bias: np.ndarray, weight: np.ndarray, out_bias: 
 
 
 @_compiled
-def _hidden_gradient(slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray) -> None:
-    """Write the output's gradient where hidden is active."""
+def _output_gradient(
+    slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray, d_bias: np.ndarray, d_weight: np.ndarray
+) -> None:
+    """Write the output's gradient where hidden is active, and add those of hidden's bias and of the output's weight."""
     zero = hidden.dtype.type(0)
     for r in range(hidden.shape[0]):
         row, d_row, slope = hidden[r], d_hidden[r], slopes[r]
         for h in range(row.size):
-            d_row[h] = slope if row[h] > zero else zero
-
-
-@_compiled
-def _output_gradient(
-    slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray, d_bias: np.ndarray, d_weight: np.ndarray
-) -> None:
-    """Add the gradients of hidden's bias and of the output's weight."""
-    for r in range(hidden.shape[0]):
-        row, d_row, slope = hidden[r], d_hidden[r], slopes[r]
-        for h in range(row.size):
-            d_bias[h] += d_row[h]
+            change = slope if row[h] > zero else zero
+            d_row[h] = change
+            d_bias[h] += change
             d_weight[h] += slope * row[h]
 
 
 @_compiled
-def _features_gradient(d_product: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, d_x: np.ndarray) -> None:
-    """Add the gradient of x: the product's, times the gate."""
-    zero = d_x.dtype.type(0)
+def _sloping_gradient(slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray) -> int:
+    """Write the output's gradient where hidden is active, of transitions that have one, and return their number."""
+    zero, number = hidden.dtype.type(0), 0
+    for s in range(slopes.shape[0]):
+        for t in range(slopes.shape[1]):
+            if slopes[s, t].any():
+                for n in range(slopes.shape[2]):
+                    row, d_row, slope = hidden[s, t, n], d_hidden[number, n], slopes[s, t, n]
+                    for h in range(row.size):
+                        d_row[h] = slope if row[h] > zero else zero
+                number += 1
+    return number
+
+
+@_compiled
+def _features_gradient(
+    slopes: np.ndarray, d_product: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, d_x: np.ndarray
+) -> None:
+    """Add the gradient of x: the product's, of transitions that have one, times the gate."""
+    zero, number = d_x.dtype.type(0), 0
     for s in range(d_x.shape[0]):
         for t in range(d_x.shape[1]):
-            d_features, offset = d_x[s, t], beta[s, min(t, beta.shape[1] - 1)]
-            gates = tau_gate[s, min(t, tau_gate.shape[1] - 1)]
-            for n in range(gates.shape[0]):
-                gate, d_out = gates[n], d_product[s, t, n]
-                for h in range(d_out.size):
-                    d_features[h] += d_out[h] * max(gate[h] + offset[h], zero)
+            if slopes[s, t].any():
+                d_features, offset = d_x[s, t], beta[s, min(t, beta.shape[1] - 1)]
+                gates = tau_gate[s, min(t, tau_gate.shape[1] - 1)]
+                for n in range(gates.shape[0]):
+                    gate, d_out = gates[n], d_product[number, n]
+                    for h in range(d_out.size):
+                        d_features[h] += d_out[h] * max(gate[h] + offset[h], zero)
+                number += 1
 
 
 @_compiled
@@ -137,7 +150,7 @@ def _huber(
 
 # ------------------------------------------------------------------------------------------------ quantile values
 class _QuantileValues(torch.autograd.Function):
-    """``output(relu(hidden(x * relu(gate(cos(frequencies * tau)) + beta))))``.
+    """``output(relu(hidden(x * relu(gate @ cos(frequencies * tau) + beta))))``.
 
     Gates are computed for some sequences at a time, and multiplied with their features for fewer: along a sequence
     that shares its fractions there are far more products than gates.
@@ -151,70 +164,83 @@ class _QuantileValues(torch.autograd.Function):
         beta: Tensor,
         frequencies: Tensor,
         gate_weight: Tensor,
-        gate_bias: Tensor,
         weight: Tensor,
         bias: Tensor,
         out_weight: Tensor,
         out_bias: Tensor,
     ) -> Tensor:
-        (sequences, steps, size), number = x.shape, tau.shape[-1]
+        (sequences, steps, size), (shared, number) = x.shape, tau.shape[1:]
         result, keep = x.new_empty(sequences, steps, number), any(ctx.needs_input_grad)
-        saved: list[Tensor] = []
-        transposed, buffer = weight.t(), _Buffer(x, steps * number)
-        for gated in _blocks(range(sequences), tau[0].numel()):
-            cosines = torch.cos(tau[gated].unsqueeze(-1) * frequencies).flatten(0, -2)
-            tau_gate = torch.addmm(gate_bias, cosines, gate_weight.t()).view(*tau[gated].shape, size)
-            saved += [cosines, tau_gate] if keep else []
+        gate_blocks = _blocks(range(sequences), shared * number)
+        longest, most = gate_blocks[0].stop, _blocks(range(sequences), steps * number)[0].stop
+        product = _Room(x, most, (steps, number, size))
+        cosines = _Room(x, longest, (shared, number, len(frequencies)), keep_all=ctx.needs_input_grad[4])
+        tau_gate = _Room(x, longest, (shared, number, size), keep_all=keep)
+        hidden = _Room(x, most, (steps, number, len(weight)), keep_all=keep)
+        parameters = bias.numpy(), out_weight.view(-1).numpy(), out_bias.numpy()
+        for gated in gate_blocks:
+            torch.mul(tau[gated].unsqueeze(-1), frequencies, out=cosines.of(gated)).cos_()
+            gates = tau_gate.of(gated)
+            torch.mm(cosines.of(gated).flatten(0, 2), gate_weight.t(), out=gates.flatten(0, 2))
             for part in _blocks(range(sequences)[gated], steps * number):
-                product = buffer.rows(part)
-                gates = tau_gate[part.start - gated.start : part.stop - gated.start]
-                _multiply(x[part].numpy(), gates.numpy(), beta[part].numpy(), product.numpy())
-                hidden = torch.mm(product.flatten(0, -2), transposed)
-                parameters = bias.numpy(), out_weight.view(-1).numpy(), out_bias.numpy()
-                _output(hidden.numpy(), *parameters, result[part].view(-1).numpy())
-                saved += [hidden] if keep else []
-        ctx.save_for_backward(x, tau, beta, gate_weight, weight, out_weight, *saved)
+                products, rows = product.of(part), hidden.of(part).flatten(0, 2)
+                among = slice(part.start - gated.start, part.stop - gated.start)
+                _multiply(x[part].numpy(), gates[among].numpy(), beta[part].numpy(), products.numpy())
+                torch.mm(products.flatten(0, 2), weight.t(), out=rows)
+                _output(rows.numpy(), *parameters, result[part].view(-1).numpy())
+        if keep:
+            ctx.save_for_backward(x, beta, gate_weight, weight, out_weight, cosines.data, tau_gate.data, hidden.data)
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        x, tau, beta, gate_weight, weight, out_weight, *saved = ctx.saved_tensors
-        need_parameters = ctx.needs_input_grad[6]
-        (sequences, steps, number), left = gradient.shape, iter(saved)
-        d_x, d_beta = torch.zeros_like(x), torch.zeros_like(beta)
-        d_gate_weight, d_gate_bias = torch.zeros_like(gate_weight), x.new_zeros(len(gate_weight))
-        d_weight, d_bias, d_out_weight = torch.zeros_like(weight), x.new_zeros(len(weight)), x.new_zeros(len(weight))
+        x, beta, gate_weight, weight, out_weight, cosines, tau_gate, hidden = ctx.saved_tensors
         gradient = gradient.contiguous()
         # The output layer's weight is the same for every row: it goes into the matrices instead of the rows.
         slopes = out_weight.view(-1, 1)
-        through, buffer, d_buffer = weight * slopes, _Buffer(x, steps * number), _Buffer(x, steps * number)
-        for gated in _blocks(range(sequences), tau[0].numel()):
-            cosines, tau_gate = next(left), next(left)
-            d_tau_gate = torch.zeros_like(tau_gate) if need_parameters else tau_gate
+        through = weight * slopes
+        if not ctx.needs_input_grad[5]:
+            return _gradient_of_features(gradient, x, beta, through, tau_gate, hidden), *[None] * 8
+        (sequences, steps, number), shared = gradient.shape, tau_gate.shape[1]
+        d_x, d_beta, d_gate_weight = torch.zeros_like(x), torch.zeros_like(beta), torch.zeros_like(gate_weight)
+        d_weight, d_bias, d_out_weight = torch.zeros_like(weight), x.new_zeros(len(weight)), x.new_zeros(len(weight))
+        gate_blocks = _blocks(range(sequences), shared * number)
+        most = _blocks(range(sequences), steps * number)[0].stop
+        d_gate = _Room(x, gate_blocks[0].stop, tau_gate.shape[1:])
+        product, d_hidden = _Room(x, most, (steps, number, x.shape[2])), _Room(x, most, hidden.shape[1:])
+        for gated in gate_blocks:
+            d_gates = d_gate.of(gated).zero_()
             for part in _blocks(range(sequences)[gated], steps * number):
-                hidden, out = next(left), gradient[part].view(-1).numpy()
-                product, d_hidden = buffer.rows(part), d_buffer.rows(part).view_as(hidden)
-                _hidden_gradient(out, hidden.numpy(), d_hidden.numpy())
-                torch.mm(d_hidden, through, out=product.view(len(hidden), -1))
+                products, d_rows = product.of(part), d_hidden.of(part).flatten(0, 2)
+                rows, out = hidden[part].flatten(0, 2).numpy(), gradient[part].view(-1).numpy()
+                _output_gradient(out, rows, d_rows.numpy(), d_bias.numpy(), d_out_weight.numpy())
+                torch.mm(d_rows, through, out=products.flatten(0, 2))
                 among = slice(part.start - gated.start, part.stop - gated.start)
-                gates = tau_gate[among].numpy(), beta[part].numpy(), d_x[part].numpy()
-                if not need_parameters:
-                    _features_gradient(product.numpy(), *gates)
-                    continue
-                _output_gradient(out, hidden.numpy(), d_hidden.numpy(), d_bias.numpy(), d_out_weight.numpy())
-                d_gates = d_tau_gate[among].numpy(), d_beta[part].numpy()
-                _product_gradient(product.numpy(), x[part].numpy(), *gates, *d_gates)
-                d_weight.addmm_(d_hidden.t(), product.view(len(hidden), -1))
-            if need_parameters:
-                d_tau_gate = d_tau_gate.flatten(0, -2)
-                d_gate_weight.addmm_(d_tau_gate.t(), cosines)
-                d_gate_bias += d_tau_gate.sum(0)
-        if not need_parameters:
-            return (d_x, *[None] * 9)
+                arrays = x[part], tau_gate[part], beta[part], d_x[part], d_gates[among], d_beta[part]
+                _product_gradient(products.numpy(), *(value.numpy() for value in arrays))
+                d_weight.addmm_(d_rows.t(), products.flatten(0, 2))
+            d_gate_weight.addmm_(d_gates.flatten(0, 2).t(), cosines[gated].flatten(0, 2))
         d_weight, d_bias = d_weight.mul_(slopes), d_bias.mul_(slopes.view(-1))
         d_output = d_out_weight.view_as(out_weight), gradient.sum().view(1)
-        return d_x, None, d_beta, None, d_gate_weight, d_gate_bias, d_weight, d_bias, *d_output
+        return d_x, None, d_beta, None, d_gate_weight, d_weight, d_bias, *d_output
+
+
+def _gradient_of_features(
+    gradient: Tensor, x: Tensor, beta: Tensor, through: Tensor, tau_gate: Tensor, hidden: Tensor
+) -> Tensor:
+    """Return the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
+    sequences, steps, number = gradient.shape
+    d_x, blocks = torch.zeros_like(x), _blocks(range(sequences), steps * number)
+    most = blocks[0].stop * steps
+    d_product, d_hidden = x.new_empty(most, number, x.shape[2]), x.new_empty(most, number, hidden.shape[3])
+    for part in blocks:
+        slopes = gradient[part].numpy()
+        sloping = _sloping_gradient(slopes, hidden[part].numpy(), d_hidden.numpy())
+        torch.mm(d_hidden[:sloping].flatten(0, 1), through, out=d_product[:sloping].flatten(0, 1))
+        gates = tau_gate[part].numpy(), beta[part].numpy()
+        _features_gradient(slopes, d_product.numpy(), *gates, d_x[part].numpy())
+    return d_x
 
 
 def _blocks(sequences: range, rows: int) -> list[slice]:
@@ -224,35 +250,38 @@ def _blocks(sequences: range, rows: int) -> list[slice]:
     return [slice(start, min(start + size, sequences.stop)) for start in starts]
 
 
-class _Buffer:
-    """Room for the products of a block ``[sequences, steps, quantiles, size]``, the same for all blocks.
+class _Room:
+    """Room ``[sequences, *shape]`` for one block after another, or for all sequences, which then keep their places.
 
     Args:
         x: features ``[B, L, H]``.
-        rows: of a sequence.
+        block: sequences of a block.
+        shape: of a sequence's part.
+        keep_all: whether there is room for all.
     """
 
-    def __init__(self, x: Tensor, rows: int) -> None:
-        self._data = x.new_empty(_blocks(range(len(x)), rows)[0].stop, x.shape[1], rows // x.shape[1], x.shape[2])
+    def __init__(self, x: Tensor, block: int, shape: Sequence[int], *, keep_all: bool = False) -> None:
+        self.data = x.new_empty(len(x) if keep_all else block, *shape)
+        self._keep_all = keep_all
 
-    def rows(self, part: slice) -> Tensor:
+    def of(self, part: slice) -> Tensor:
         """Return the room for these sequences."""
-        return self._data[: part.stop - part.start]
+        return self.data[part] if self._keep_all else self.data[: part.stop - part.start]
 
 
 def quantile_values(
-    x: Tensor, tau: Tensor, beta: Tensor, frequencies: Tensor, gate: nn.Linear, hidden: nn.Linear, output: nn.Linear
+    x: Tensor, tau: Tensor, beta: Tensor, frequencies: Tensor, gate: Tensor, hidden: nn.Linear, output: nn.Linear
 ) -> Tensor:
-    """Return ``output(relu(hidden(x * relu(gate(cos(frequencies * tau)) + beta))))``, ``[B, L, N]``.
+    """Return ``output(relu(hidden(x * relu(gate @ cos(frequencies * tau) + beta))))``, ``[B, L, N]``.
 
     Either all layers and ``beta`` take a gradient, or only ``x`` does.
 
     Args:
         x: features of a transition ``[B, L, H]``.
         tau: fractions ``[B, L, N]``, or ``[B, 1, N]`` where constant along a sequence.
-        beta: its part of the gate before rectification, ``[B, L, H]`` or ``[B, 1, H]``.
+        beta: its part of the gate before rectification, bias included, ``[B, L, H]`` or ``[B, 1, H]``.
         frequencies: of the fractions' cosines ``[C]``.
-        gate: linear layer C to H.
+        gate: weight of the fractions' part of the gate ``[H, C]``.
         hidden: linear layer H to H'.
         output: linear layer H' to 1.
     """
@@ -260,8 +289,8 @@ def quantile_values(
     if tau.shape[1] == beta.shape[1] == shape[1]:
         # Nothing is shared along a sequence: blocks need not hold whole ones.
         x, tau, beta = (value.reshape(-1, 1, value.shape[-1]) for value in (x, tau, beta))
-    parameters = [p for layer in (gate, hidden, output) for p in (layer.weight, layer.bias)]
-    values = _QuantileValues.apply(x.contiguous(), tau, beta.contiguous(), frequencies, *parameters)
+    parameters = [p for layer in (hidden, output) for p in (layer.weight, layer.bias)]
+    values = _QuantileValues.apply(x.contiguous(), tau, beta.contiguous(), frequencies, gate, *parameters)
     return values.view(*shape, -1)
 
 
