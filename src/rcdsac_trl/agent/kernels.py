@@ -28,7 +28,10 @@ _SEEN = 3
 
 
 # ------------------------------------------------------------------------------------------------ compiled passes
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+
+
+@_compiled
 def rectify(rows: np.ndarray, bias: np.ndarray) -> None:
     """Add the bias to every row and rectify, in place."""
     zero = rows.dtype.type(0)
@@ -38,7 +41,7 @@ def rectify(rows: np.ndarray, bias: np.ndarray) -> None:
             row[h] = max(row[h] + bias[h], zero)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _heard(bins: np.ndarray, taps: int) -> np.ndarray:
     """Return the positions of the second convolution that see a bin which is not 0 in all the batch, or the first."""
     sounds = np.zeros(bins.shape[1], np.uint8)
@@ -51,7 +54,7 @@ def _heard(bins: np.ndarray, taps: int) -> np.ndarray:
     return np.array([p for p in range(last + 1) if p == 0 or sounds[4 * p : 4 * p + span].any()], np.int64)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _first_layer(
     bins: np.ndarray, positions: np.ndarray, weight: np.ndarray, bias: np.ndarray, windows: np.ndarray
 ) -> None:
@@ -69,7 +72,7 @@ def _first_layer(
                     window[j + c] = max(value + x3 * weight[3, c] + x4 * weight[4, c], zero)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _first_layer_gradient(
     bins: np.ndarray,
     positions: np.ndarray,
@@ -97,7 +100,7 @@ def _first_layer_gradient(
                     d_weight[4, c] += x4 * slope
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _divide(by_position: np.ndarray, positions: np.ndarray, heard: np.ndarray, silent: np.ndarray) -> None:
     """Copy the linear layer's weight ``[features, position, channel]`` where heard, and add it up where silent."""
     for f in range(by_position.shape[0]):
@@ -116,7 +119,7 @@ def _divide(by_position: np.ndarray, positions: np.ndarray, heard: np.ndarray, s
                     total[c] += row[c]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@_compiled
 def _unite(
     d_by_position: np.ndarray, positions: np.ndarray, d_heard: np.ndarray, d_bias: np.ndarray, value: np.ndarray
 ) -> None:

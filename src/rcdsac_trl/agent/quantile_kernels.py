@@ -25,8 +25,9 @@ _ROWS_PER_BLOCK = 1024
 
 
 # ------------------------------------------------------------------------------------------------ compiled passes
-# A sum over features may be added up in any order, which lets several be added at once.
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"})
+# A sum over features may be added up in any order, which lets several be added at once. A loop has few arrays: of many
+# the compiler gives up showing that they are apart.
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
 
 
 @_compiled
@@ -64,9 +65,9 @@ def _output_gradient(
     for r in range(hidden.shape[0]):
         row, d_row, slope = hidden[r], d_hidden[r], slopes[r]
         for h in range(row.size):
-            change = slope if row[h] > zero else zero
-            d_row[h] = change
-            d_bias[h] += change
+            d_row[h] = slope if row[h] > zero else zero
+        for h in range(row.size):
+            d_bias[h] += d_row[h]
             d_weight[h] += slope * row[h]
 
 
