@@ -128,7 +128,8 @@ def test_the_log_agrees_with_the_tables(tiny_run: Path) -> None:
         of_beta = validation[validation["beta"] == -1.5].groupby("iteration")[metric].mean()
         logged = [e.value for e in events.Scalars(f"validation/{metric}/-1.5")]
         assert logged == pytest.approx(of_beta.tolist(), abs=1e-4)
-    score = validation.groupby("iteration")["reward"].mean()
+    means = validation.groupby("iteration")[["reward", "collisions", "contact_fraction"]].mean()
+    score = means["reward"] - 10.0 * means["collisions"] - STEPS * means["contact_fraction"]
     assert [e.value for e in events.Scalars("validation/score")] == pytest.approx(score.tolist(), abs=1e-4)
 
 

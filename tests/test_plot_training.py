@@ -54,11 +54,14 @@ def test_rows_without_beta_have_their_own_labels() -> None:
 
 def test_the_best_checkpoint_has_the_highest_mean_over_the_conditions() -> None:
     # 8.5, 70 and 40 over both betas, however many episodes a beta has.
-    no_contact = TWO_BETAS.assign(contact_fraction=0.0)
+    no_contact = TWO_BETAS.assign(contact_fraction=0.0, collisions=0.0)
     assert best_updates(no_contact, 1000) == 200
     # A step in contact counts as much as a reward of 1: 40 in each of these episodes.
     leaning = no_contact.assign(contact_fraction=no_contact["updates"].map({100: 0.0, 200: 0.04, 300: 0.0}))
     assert best_updates(leaning, 1000) == 300
+    # So does a tenth of a collision, beside what the reward charges for it.
+    colliding = no_contact.assign(collisions=no_contact["updates"].map({100: 0.0, 200: 4.0, 300: 0.0}))
+    assert best_updates(colliding, 1000) == 300
     # Of equal scores the first stays, as in training.
     assert best_updates(validation(-1.0, NAN, {5: [3.0], 9: [3.0]}), 1000) == 5
 
