@@ -123,3 +123,8 @@ def test_a_trend_either_way_is_found_and_none_is_not() -> None:
 def test_a_map_without_a_value_says_nothing_about_the_trend() -> None:
     values = np.array([[0.0, 1.0, 2.0], [3.0, np.nan, 1.0]])
     assert statistics.trend(values).correlation == pytest.approx(1.0)
+
+
+def test_what_was_never_measured_has_no_interval() -> None:
+    interval = statistics.bootstrap(np.full((1, 3, 2), np.nan))
+    assert np.isnan([interval.value, interval.low, interval.high]).all()

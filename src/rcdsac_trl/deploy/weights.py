@@ -229,27 +229,56 @@ def read_weights(folder: Path) -> Weights:
     if sha256(content).hexdigest() != digest:
         raise UserInputError(f"{folder / WEIGHTS_NAME} is not what {CONFIG_NAME} says it is: export the agent anew")
     try:
-        return Weights(AgentConfig(**values), load_tensors(content))
+        tensors = {name: _single(tensor) for name, tensor in load_tensors(content).items()}
+        return Weights(AgentConfig(**values), tensors)
     except UserInputError as error:
         raise UserInputError(f"{folder}: {error}") from error
     except (TypeError, ValueError, AttributeError, SafetensorError) as error:
         raise UserInputError(f"{folder} cannot be read ({error}): export the agent anew") from error
 
 
-def packed(weights: Weights) -> dict[str, bytes]:
-    """Return the files of a weights folder: name and content."""
-    content = save_tensors({name: np.ascontiguousarray(value) for name, value in weights.tensors.items()})
+def _single(tensor: NDArray[Any]) -> NDArray[Any]:
+    """Return what was stored in half precision in single precision, and anything else as it is."""
+    return tensor.astype(np.float32) if tensor.dtype == np.float16 else tensor
+
+
+def halved(weights: Weights) -> Weights:
+    """Return the agent as it is after having been stored in half precision, which halves its file.
+
+    Raises:
+        UserInputError: if a number is too large for half precision.
+    """
+    with np.errstate(over="ignore"):  # a number that is not finite is refused
+        tensors = {name: _single(value.astype(np.float16)) for name, value in weights.tensors.items()}
+    return Weights(weights.config, tensors)
+
+
+def packed(weights: Weights, *, half: bool = False, results: str = "") -> dict[str, bytes]:
+    """Return the files of a weights folder: name and content.
+
+    Args:
+        weights: of the agent.
+        half: store them in half precision, as :func:`halved` has them.
+        results: what the card says of how the agent drives, Markdown.
+    """
+    stored = np.float16 if half else np.float32
+    content = save_tensors({name: np.ascontiguousarray(value, stored) for name, value in weights.tensors.items()})
     config: dict[str, Any] = {"format_version": FORMAT_VERSION, "weights_sha256": sha256(content).hexdigest()}
     config |= asdict(weights.config)
     return {
         WEIGHTS_NAME: content,
-        CARD_NAME: model_card(weights).encode(),
+        CARD_NAME: model_card(weights, results).encode(),
         CONFIG_NAME: (json.dumps(config, indent=2) + "\n").encode(),
     }
 
 
-def model_card(weights: Weights) -> str:
-    """Return what a person should know before driving with an agent, as Markdown."""
+def model_card(weights: Weights, results: str = "") -> str:
+    """Return what a person should know before driving with an agent, as Markdown.
+
+    Args:
+        weights: of the agent.
+        results: what is known of how it drives, Markdown.
+    """
     config = weights.config
     parameters = sum(tensor.size for tensor in weights.tensors.values())
     told = "nothing besides observations"
@@ -277,6 +306,9 @@ policy = rcdsac_trl.load("this/folder")
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |
 | gives | linear velocity in m/s, angular velocity in rad/s |
 {origin}
+
+{results}
+## Limits
 
 Trained in simulation only, on a differential-drive robot of 0.25 m radius. It has driven no real robot: keep the
 speed limit and the stop zone on, and a hand on the emergency stop.

@@ -207,6 +207,8 @@ def _improvements(first: Array, second: Array) -> Array:
 
 
 def _interval(value: float, drawn: Array) -> Interval:
+    if np.isnan(drawn).all():  # nobody ever measured it, such as a time to goals that none reached
+        return Interval(float("nan"), float("nan"), float("nan"))
     low, high = np.nanquantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return Interval(float(value), float(low), float(high))
 

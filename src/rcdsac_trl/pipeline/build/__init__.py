@@ -4,6 +4,7 @@ from rcdsac_trl.pipeline.build.calibration import calibration
 from rcdsac_trl.pipeline.build.course import course
 from rcdsac_trl.pipeline.build.evaluation import evaluation
 from rcdsac_trl.pipeline.build.export import Export, export
+from rcdsac_trl.pipeline.build.publish import publication
 from rcdsac_trl.pipeline.build.resume import run_to_continue
 from rcdsac_trl.pipeline.build.search import search
 from rcdsac_trl.pipeline.build.sweep import check_single, sweep
@@ -19,6 +20,7 @@ __all__ = [
     "export",
     "failure",
     "given_overrides",
+    "publication",
     "resumed",
     "run_folder",
     "run_to_continue",

@@ -15,6 +15,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.cli import choices
 from rcdsac_trl.pipeline.course.settings import CourseSettings
 from rcdsac_trl.pipeline.logs import CONFIG_NAME
+from rcdsac_trl.pipeline.publishing import PublishSettings
 from rcdsac_trl.pipeline.run_settings import (
     CalibrationSettings,
     EvaluationSettings,
@@ -78,6 +79,15 @@ def export_settings(cfg: DictConfig) -> ExportSettings:
         UserInputError: for whatever it holds that cannot work.
     """
     return read(ExportSettings, _plain(cfg))
+
+
+def publish_settings(cfg: DictConfig) -> PublishSettings:
+    """Read the config of a publication.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(PublishSettings, _plain(cfg))
 
 
 @dataclass(frozen=True)
