@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from rcdsac_trl.agent.quantile_kernels import quantile_huber
+from rcdsac_trl.agent.huber_kernel import quantile_huber
 
 
 def quantile_huber_loss(quantiles: Tensor, targets: Tensor, tau: Tensor, kappa: float = 1.0) -> Tensor:
