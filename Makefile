@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c c
 # Programs of benchmarks/, in the order they run.
 BENCHMARKS := deploy learner collection evaluation whole_job scaling_learner scaling_world
 
-.PHONY: setup train smoke test test-slow check format bench clean
+.PHONY: setup train smoke test test-slow check format bench notebooks clean
 
 train: setup
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
@@ -29,6 +29,10 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Run the notebooks anew, in place.
+notebooks: setup
+	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
 format: setup
 	$(BIN)/ruff check --fix .

@@ -1,0 +1,35 @@
+"""The notebooks run from top to bottom, and are saved with what they show."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).parents[1] / "notebooks"
+NOTEBOOKS = sorted(path.name for path in FOLDER.glob("*.ipynb"))
+
+
+def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+
+
+def figures(notebook: nbformat.NotebookNode) -> int:
+    return sum("image/png" in output.get("data", {}) for output in outputs(notebook))
+
+
+def test_there_are_three_stories() -> None:
+    assert NOTEBOOKS == ["1_quantile_curves.ipynb", "2_from_runs_to_the_table.ipynb", "3_your_own_risk_measure.ipynb"]
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_it_runs_and_shows_what_was_saved(name: str) -> None:
+    saved = nbformat.read(FOLDER / name, as_version=4)
+    nbformat.validate(saved)
+    code = [cell for cell in saved.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), "saved after one run of all cells"
+    assert not any("/home/" in str(output) or "/root/" in str(output) for output in outputs(saved))
+    executed = nbformat.read(FOLDER / name, as_version=4)
+    # Raises the cell's error, should there be one.
+    NotebookClient(executed, timeout=600, resources={"metadata": {"path": str(FOLDER)}}).execute()
+    assert figures(executed) == figures(saved) > 0
