@@ -286,7 +286,7 @@ def model_card(weights: Weights, results: str = "") -> str:
         told = f"`{config.context}` in [{config.context_range[0]:g}, {config.context_range[1]:g}]"
     if config.fixed_beta is not None:
         told += f"; it was trained for beta = {config.fixed_beta:g} alone"
-    origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items())
+    origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items() if value is not None)
     return f"""# {config.name}, {config.sensor} sensor
 
 A navigation agent of [rcdsac_trl](https://pypi.org/project/rcdsac-trl/): recurrent actor and {config.num_critics}
