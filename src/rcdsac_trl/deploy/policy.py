@@ -121,16 +121,24 @@ class Policy:
             raise UserInputError(
                 f"the memory of {self.config.name} depends on its collision weight: call act() instead"
             )
-        try:
-            embedded = self._embedded(self._context(beta, None))
-        except BadInputError as error:
-            raise UserInputError(str(error)) from None
+        embedded = self._embedded(self.check_beta(beta))
         if action is None:
             return self._outlook(embedded)
         asked = np.asarray(action, dtype=np.float32)
         if asked.shape != (2,) or not np.all(np.abs(asked) <= 1.0):
             raise UserInputError(f"action={action} is not two numbers from -1 to 1: give u_0 and u_1")
         return self._outlook(embedded, asked)
+
+    def check_beta(self, beta: float | None) -> float | None:
+        """Return what the agent is told for a `beta`, None where that is nothing.
+
+        Raises:
+            UserInputError: if :meth:`act` would refuse to drive with it.
+        """
+        try:
+            return self._context(beta, None)
+        except BadInputError as error:
+            raise UserInputError(str(error)) from None
 
     def stop(self) -> None:
         """Make every command one to stand, until :meth:`resume`."""
