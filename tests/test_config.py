@@ -331,6 +331,8 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         settings = tiny_settings("sac", f"collector={name}", "collector.num_processes=2", given)
         make_episodes(settings, make_actor(settings), "cpu", Progress())
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")
+    turned = "beta_controller=[clearance,tail_variance,bandit]"
+    evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
     evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5")
     every = {(cls.__name__, field.name) for cls in classes for field in fields(cls)}

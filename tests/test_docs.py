@@ -66,6 +66,7 @@ def test_there_are_commands_of_every_verb() -> None:
         "draw_maps",
         "search",
         "course",
+        "publish",
     }
 
 

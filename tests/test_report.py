@@ -315,3 +315,4 @@ def test_a_run_that_logged_no_time_is_drawn_over_its_updates(tmp_path: Path) -> 
     over_updates, over_minutes = ([len(axes.lines) for axes in panels[side::2]] for side in (0, 1))
     assert (over_updates, over_minutes) == ([2, 2], [1, 1])
     assert panels[1].lines[0].get_xdata().tolist() == [1, 3]
+    assert len(learning_curves({"silent": runs["silent"]}).axes) == 2

@@ -110,8 +110,10 @@ def learning_curves(runs: Mapping[str, pd.DataFrame]) -> Figure:
     """
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     figure.suptitle("Validation during training", x=0.01, ha="left", fontsize=13, color=INK)
-    panels = figure.subplots(2, 2)
-    for column, (clock, label, scale) in enumerate((("updates", "updates", 1.0), ("elapsed_s", "minutes", 1 / 60))):
+    clocks = (("updates", "updates", 1.0), ("elapsed_s", "minutes", 1 / 60))
+    shown = [clock for clock in clocks if any(clock[0] in rows for rows in runs.values())]
+    panels = figure.subplots(2, len(shown), squeeze=False)
+    for column, (clock, label, scale) in enumerate(shown):
         for row, metric in enumerate(_LEARNT):
             axes = panels[row][column]
             for number, ((name, rows), color) in enumerate(zip(runs.items(), shades(len(runs)), strict=True)):
