@@ -112,6 +112,8 @@ def test_a_killed_run_leaves_no_process_and_is_continued(tmp_path: Path) -> None
     check_killed_run_is_continued(tmp_path, *GROUP)
 
 
+# submitit lets go of the programs that it has started before they have ended.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.slow
 def test_by_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("submitit")
