@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
+from rcdsac_trl.deploy.policy import fractions_of
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.recording import Moment
 from rcdsac_trl.pipeline.video import Frame
@@ -179,7 +180,7 @@ class _Panel:
         def line_of(value: float) -> float:
             return bottom - (value - low) / (high - low) * (bottom - top)
 
-        fractions = (np.arange(len(quantiles)) + 0.5) / len(quantiles)
+        fractions = fractions_of(len(quantiles)).tolist()
         points = [(left + x * (right - left), line_of(y)) for x, y in zip(fractions, quantiles.tolist(), strict=True)]
         tail = left + _TAIL * (right - left)
         draw.rectangle((left, top, tail, bottom), (*TOUCHING, 36))
