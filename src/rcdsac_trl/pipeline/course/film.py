@@ -11,6 +11,7 @@ from rcdsac_trl.pipeline.course.drive import PERIOD_S, Pilot, Trace
 from rcdsac_trl.pipeline.video import Frame
 from rcdsac_trl.world.office import Office
 from rcdsac_trl.world.render import Renderer, Scene
+from rcdsac_trl.world.task import collision_due
 
 FPS = 3 / PERIOD_S
 """Frames a second: films show runs three times as fast as they were driven."""
@@ -37,11 +38,12 @@ def frames(office: Office, pilot: Pilot, trace: Trace, course: NDArray[np.float6
     follower = PathFollower(course, pilot.config)
     mask = sensor_mask("narrow")
     radii = np.array([mover.radius for mover in office.map.movers])
+    contacts = trace.in_contact.tolist()
     collisions = 0
     for step in range(len(trace.commands)):
         waypoints = follower.update(_pose(trace.estimates[step]))
         assert waypoints is not None  # else the run would have ended
-        collisions += int(trace.in_contact[step] and not trace.in_contact[max(step - 1, 0)])
+        collisions += collision_due(contacts[step], contacts[max(step - 1, 0)], "onset")
         scene = Scene(
             map=office.map,
             pose=_pose(trace.poses[step]),
