@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rcdsac_trl.deploy.inference import Actor, Array, Critic, Encoders
+from rcdsac_trl.deploy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.modules import ACTION_SIZE, ActorStep, CriticStep
 from rcdsac_trl.deploy.policy import fractions_of
 from rcdsac_trl.deploy.weights import Weights
@@ -205,10 +205,9 @@ def _torch_runner(module: Callable[..., tuple[Tensor, Tensor]], names: tuple[str
 
 def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Runner]:
     config, mask = weights.config, sensor_mask(weights.config.sensor)
-    numbers = range(config.num_critics)
     own = Encoders([weights.part("actor.encoder")], mask)
-    theirs = Encoders([weights.part(f"critics.{number}.encoder") for number in numbers], mask)
-    actor, critics = Actor(weights), [Critic(weights, number, fractions) for number in numbers]
+    theirs = Encoders([weights.part(f"critics.{number}.encoder") for number in range(config.num_critics)], mask)
+    actor, critics = Actor(weights), Critics(weights, fractions)
 
     def told(inputs: dict[str, Array]) -> tuple[Array, float | None]:
         context = float(inputs["context"][0, 0])
@@ -226,8 +225,6 @@ def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Run
     def judge(inputs: dict[str, Array]) -> tuple[Array, Array]:
         vectors, embedded = told(inputs)
         memories = theirs.step(inputs["range"][0], vectors, inputs["memories"][:, 0])
-        action = inputs["action"][0]
-        values = [critic.values(memory, action, embedded) for critic, memory in zip(critics, memories, strict=True)]
-        return np.min(values, axis=0)[None], memories[:, None]
+        return critics.values(memories, inputs["action"][0], embedded).min(axis=0)[None], memories[:, None]
 
     return [act, judge]

@@ -16,7 +16,7 @@ from rcdsac_trl.deploy.checks import (
 )
 from rcdsac_trl.deploy.command import Command, Outlook
 from rcdsac_trl.deploy.guard import Guard
-from rcdsac_trl.deploy.inference import Actor, Array, Critic, Encoders
+from rcdsac_trl.deploy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.sectors import Sectors, is_finite_number
 from rcdsac_trl.deploy.weights import Weights
 from rcdsac_trl.errors import UserInputError
@@ -76,11 +76,10 @@ class Policy:
         self.default_beta = middle if self.config.context == "beta" else None
         self._default_weight = middle if self.config.context == "collision_weight" else None
         self._mask = sensor_mask(self.config.sensor)
-        numbers = range(self.config.num_critics)
-        parts = ["actor", *(f"critics.{number}" for number in numbers)]
+        parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
         self._encoders = Encoders([weights.part(f"{part}.encoder") for part in parts], self._mask)
         self._actor = Actor(weights)
-        self._critics = [Critic(weights, number, self.fractions) for number in numbers]
+        self._critics = Critics(weights, self.fractions)
         self._halted = False
         self._memories: Array
         self._steps: int
@@ -240,11 +239,7 @@ class Policy:
     def _outlook(self, embedded: float | None, action: Array | None = None) -> Outlook:
         if action is None:
             action = self._actor.action(self._memories[0], embedded)
-        told = [
-            critic.values(memory, action, embedded)
-            for critic, memory in zip(self._critics, self._memories[1:], strict=True)
-        ]
-        lower = np.min(told, axis=0)
+        lower = self._critics.values(self._memories[1:], action, embedded).min(axis=0)
         quantiles = lower if self.config.critic == "quantile" else None
         return Outlook(action, desired_velocities(action), quantiles, float(lower.mean()))
 
