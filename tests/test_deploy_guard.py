@@ -87,6 +87,54 @@ def test_no_command_drives_into_what_is_sensed(seed: int) -> None:
             assert free_distance(x, y, segments, circles) > guard.radius_m
 
 
+def plain_limit(guard: Guard, v: float, sectors: Sectors, omega: float, moving: tuple[float, float]) -> float:
+    """Return the linear velocity that the stop zone leaves: share by share, place by place, each sector's borders."""
+    angles = np.arange(181) * math.pi / 90.0
+    directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    seen = np.isfinite(sectors.distances_m)
+    for share in (1.0, 0.75, 0.5, 0.25):
+        clearances = []
+        for place in plain_way(share * v, omega, moving, guard.reaction_s):
+            gaps = [math.inf]
+            for borders in (directions[:-1], directions[1:]):
+                along = np.maximum(borders @ place, sectors.distances_m)[seen]
+                gaps.extend(np.hypot(*(place - along[:, None] * borders[seen]).T))
+            clearances.append(min(gaps) - guard.radius_m)
+        needed = min(guard.margin_m, max(clearances[0] - 0.01, 0.01), clearances[0])
+        if min(clearances) >= needed:
+            return share * v
+    return 0.0
+
+
+def plain_way(v: float, omega: float, moving: tuple[float, float], reaction_s: float) -> list[tuple[float, float]]:
+    """Return the places of a way, by the motors' own rule in steps of 0.05 s."""
+    x = y = yaw = 0.0
+    places, step = [(x, y)], 0
+    while step < round(reaction_s / 0.05) or abs(moving[0]) > 1e-9:
+        moving = clip_command(*((v, omega) if step < round(reaction_s / 0.05) else (0.0, 0.0)), *moving, 0.05)
+        middle = yaw + moving[1] * 0.025
+        x, y = x + moving[0] * 0.05 * math.cos(middle), y + moving[0] * 0.05 * math.sin(middle)
+        yaw += moving[1] * 0.05
+        places.append((x, y))
+        step += 1
+    return places
+
+
+@pytest.mark.parametrize("guard", [Guard(), Guard(margin_m=0.2, reaction_s=0.4), Guard(margin_m=0.0, radius_m=0.1)])
+def test_it_decides_as_the_definition_says(guard: Guard) -> None:
+    rng = np.random.default_rng(3)
+    decided = set()
+    for _ in range(300):
+        nearest = guard.radius_m + rng.uniform(0.0, guard.margin_m + 0.5 * guard.reaction_s + 0.1)
+        there = rng.random(180) < rng.uniform(0.0, 0.3)
+        sectors = Sectors(np.where(there, rng.uniform(nearest, nearest + 0.4, 180), np.inf), ALL)
+        (v, omega), moving = rng.uniform((-0.2, -1.5), (0.6, 1.5)), rng.uniform((-0.3, -1.5), (0.8, 1.5))
+        expected = plain_limit(guard, v, sectors, omega, moving)
+        assert guard.limit(v, omega, sectors, moving)[0] == expected
+        decided.add(round(expected / v, 2))
+    assert decided == {0.0, 0.25, 0.5, 0.75, 1.0}
+
+
 @pytest.mark.parametrize("bad", [{"max_speed_m_per_s": -1.0}, {"margin_m": math.nan}, {"radius_m": 0.0}])
 def test_what_is_no_limit_is_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(UserInputError, match=f"{next(iter(bad))}="):

@@ -42,16 +42,21 @@ def header(now_s: float, frame: str) -> Any:
     return TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
 
 
+def single(value: float) -> float:
+    return float(np.float32(value))
+
+
 def laser(now_s: float, ranges: Any = None) -> Any:
+    """Return a scan as it arrives: its numbers are in single precision, as those of a recorded one."""
     ranges = np.full(360, 2.0, np.float32) if ranges is None else np.asarray(ranges, np.float32)
     return TYPES["sensor_msgs/msg/LaserScan"](
         header=header(now_s, "laser"),
-        angle_min=-math.pi,
-        angle_max=math.pi,
-        angle_increment=2 * math.pi / len(ranges),
+        angle_min=single(-math.pi),
+        angle_max=single(math.pi),
+        angle_increment=single(2 * math.pi / len(ranges)),
         time_increment=0.0,
-        scan_time=0.1,
-        range_min=0.1,
+        scan_time=single(0.1),
+        range_min=single(0.1),
         range_max=10.0,
         ranges=ranges,
         intensities=np.empty(0, np.float32),
@@ -109,7 +114,7 @@ def test_laser_odometry_and_path() -> None:
     assert stamp_s(laser(12.25)) == 12.25
     mount = Mount(x_m=0.1)
     scan = scan_of(laser(0.0), mount)
-    assert (scan.range_min, scan.range_max, scan.mount) == (0.1, 10.0, mount)
+    assert (scan.range_min, scan.range_max, scan.mount) == (single(0.1), 10.0, mount)
     assert scan_sectors(scan_of(laser(0.0))).distances_m.tolist() == [2.0] * 180
     message = odometry(0.0, (1.0, 2.0, -2.5))
     assert pose_of_odometry(message) == pytest.approx((1.0, 2.0, -2.5))
@@ -223,30 +228,34 @@ def test_clouds_of_all_cameras_are_needed_and_the_oldest_counts() -> None:
 
 
 # ------------------------------------------------------------------------------------------------ recorded bags
-def drive() -> Iterator[tuple[float, str, str, Any]]:
-    """Yield time, topic, type and message of a short drive along a corridor, with one scan dropped."""
-    yield 99.9, "/path", "nav_msgs/msg/Path", path(99.9, [(0.0, 0.0), (3.0, 0.0), (3.0, 4.0)])
+def drive() -> Iterator[tuple[int, str, str, Any]]:
+    """Yield time (ns), topic, type and message of a short drive along a corridor, with some scans dropped.
+
+    No two times are equal: bags give messages by their time alone.
+    """
+    yield 99_900_000_000, "/plan", "nav_msgs/msg/Path", path(99.9, [(0.0, 0.0), (3.0, 0.0), (3.0, 4.0)])
     for step in range(20):
         now = 100.0 + PERIOD_S * step
-        yield now, "/odom", "nav_msgs/msg/Odometry", odometry(now, (0.05 * step, 0.0, 0.01 * step))
+        yield round(1e9 * now), "/odom", "nav_msgs/msg/Odometry", odometry(now, (0.05 * step, 0.0, 0.01 * step))
         if not 8 <= step < 12:
+            now += 0.01
             angles = -math.pi + 2 * math.pi * np.arange(360) / 360
             with np.errstate(divide="ignore"):
                 ranges = np.minimum(1.2 / np.abs(np.sin(angles)), 20.0)
-            yield now, "/scan", "sensor_msgs/msg/LaserScan", laser(now, ranges)
+            yield round(1e9 * now), "/scan", "sensor_msgs/msg/LaserScan", laser(now, ranges)
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_a_recorded_bag_drives_as_the_live_messages_do(storage: StoragePlugin, tmp_path: Path) -> None:
     with Writer(tmp_path / "drive", version=9, storage_plugin=storage) as writer:
         connections: dict[str, Any] = {}
-        for now, topic, kind, message in drive():
+        for nanoseconds, topic, kind, message in drive():
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], round(now * 1e9), STORE.serialize_cdr(message, kind))
+            writer.write(connections[topic], nanoseconds, STORE.serialize_cdr(message, kind))
 
     live, played = Driver(Policy(agent())), Driver(Policy(agent()))
-    expected = [give(live, topic, message, now) for now, topic, _, message in drive()]
+    expected = [give(live, topic, message, nanoseconds) for nanoseconds, topic, _, message in drive()]
     found = []
     with (
         Reader(tmp_path / "drive") as reader,
@@ -256,7 +265,7 @@ def test_a_recorded_bag_drives_as_the_live_messages_do(storage: StoragePlugin, t
         commands = writer.add_connection("/cmd_vel", kind, typestore=STORE)
         for connection, nanoseconds, raw in reader.messages():
             message = STORE.deserialize_cdr(raw, connection.msgtype)
-            found.append(give(played, connection.topic, message, nanoseconds * 1e-9))
+            found.append(give(played, connection.topic, message, nanoseconds))
             sent = twist_stamped(found[-1], nanoseconds * 1e-9, MAKE)
             writer.write(commands, nanoseconds, STORE.serialize_cdr(sent, kind))
     assert [c.wanted for c in found] == [c.wanted for c in expected]
@@ -271,9 +280,13 @@ def test_a_recorded_bag_drives_as_the_live_messages_do(storage: StoragePlugin, t
     )
 
 
-def give(driver: Driver, topic: str, message: Any, now_s: float) -> Any:
-    {"/path": driver.on_path, "/odom": driver.on_odometry, "/scan": driver.on_scan}[topic](message)
-    return driver.command(now_s)
+def give(driver: Driver, topic: str, message: Any, nanoseconds: int) -> Any:
+    {"/plan": driver.on_path, "/odom": driver.on_odometry, "/scan": driver.on_scan}[topic](message)
+    return driver.command(nanoseconds * 1e-9)
+
+
+def is_subscription(call: ast.Call) -> bool:
+    return isinstance(call.func, ast.Attribute) and call.func.attr == "create_subscription"
 
 
 def test_the_node_only_uses_what_the_core_has() -> None:
@@ -284,6 +297,8 @@ def test_the_node_only_uses_what_the_core_has() -> None:
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("rcdsac_trl"):
             module = __import__(str(node.module), fromlist=["_"])
             assert all(hasattr(module, alias.name) for alias in node.names)
+    subscribed = [node.args[1] for node in ast.walk(tree) if isinstance(node, ast.Call) and is_subscription(node)]
+    assert [ast.literal_eval(name) for name in subscribed] == ["scan", "odom", "plan"]  # dds_node's, and Nav2's
     driver = Driver(Policy(agent()))
     used = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     for name in (text.removeprefix("self.driver.") for text in used if text.startswith("self.driver.")):

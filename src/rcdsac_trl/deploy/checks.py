@@ -16,6 +16,8 @@ from rcdsac_trl.interface import MAX_RANGE_M, MIN_RANGE_M, NUM_BINS, WAYPOINT_DI
 _FASTEST_M_PER_S = 2.0
 _FASTEST_RAD_PER_S = 2.0 * math.pi
 _FARTHEST_RANGE_M = 200.0
+_EVERYWHERE = np.ones(NUM_BINS, dtype=np.bool_)
+_EVERYWHERE.flags.writeable = False
 # Clocks of two computers differ a little.
 _CLOCK_SLACK_S = 0.05
 
@@ -96,27 +98,40 @@ def sectors_of(ranges: Any, mask: NDArray[np.bool_], limits: InputLimits) -> Sec
             ranges = scan_sectors(ranges)
         except UserInputError as error:
             raise BadInputError(str(error)) from error
-    covered = np.ones(NUM_BINS, dtype=np.bool_)
+    covered = _EVERYWHERE
     if isinstance(ranges, Sectors):
         covered = _array(ranges.covered, (NUM_BINS,), "covered").astype(np.bool_)
         ranges = ranges.distances_m
     distances = _array(ranges, (NUM_BINS,), "ranges")
-    known = distances[covered]
+    _check_ranges(distances if covered is _EVERYWHERE else distances[covered])
+    if covered is not _EVERYWHERE:
+        _check_lost(mask, covered, limits)
+    return Sectors(np.where(covered & (distances < MAX_RANGE_M), distances, math.inf), covered)
+
+
+def _check_ranges(known: NDArray[np.float64]) -> None:
+    """Refuse measured ranges, [n], if one of them is none."""
+    # Counting is the cheapest way to look at all of them; NaN is not above anything.
+    above = np.count_nonzero(known > MIN_RANGE_M) == len(known)
+    if above and np.count_nonzero(known > _FARTHEST_RANGE_M) == np.count_nonzero(known == math.inf):
+        return
     if np.isnan(known).any():
         raise BadInputError("ranges hold NaN: mark what is not measured as not covered (Sectors), or pass the Scan")
-    if (known <= MIN_RANGE_M).any():
+    if not above:
         raise BadInputError(
             f"ranges go down to {known.min():g} m, below {MIN_RANGE_M:g} m is no measurement: inf means nothing there"
         )
-    if (far := known[np.isfinite(known)]).size and far.max() > _FARTHEST_RANGE_M:
-        raise BadInputError(f"a range of {far.max():g} is not in metres: inf means nothing there")
+    raise BadInputError(f"a range of {known[np.isfinite(known)].max():g} is not in metres: inf means nothing there")
+
+
+def _check_lost(mask: NDArray[np.bool_], covered: NDArray[np.bool_], limits: InputLimits) -> None:
+    """Refuse a sensor that says too little about the agent's range bins."""
     lost = np.count_nonzero(mask & ~covered) / np.count_nonzero(mask)
     if lost > limits.max_lost_share:
         raise BadInputError(
             f"{100 * lost:.0f} % of the range bins this agent sees are not measured, more than "
             f"{100 * limits.max_lost_share:g} %: is the sensor blind, or of another kind?"
         )
-    return Sectors(np.where(covered & (distances < MAX_RANGE_M), distances, np.inf), covered)
 
 
 def waypoints_of(waypoints: Any) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -130,15 +145,15 @@ def waypoints_of(waypoints: Any) -> tuple[tuple[float, float], tuple[float, floa
         array = np.broadcast_to(array, (2, 2))
     if array.shape != (2, 2):
         raise BadInputError(f"waypoints have shape {list(array.shape)}: give x and y of the next two, [2, 2]")
-    if not np.isfinite(array).all():
+    (x_1, y_1), (x_2, y_2) = array.tolist()
+    if not all(math.isfinite(value) for value in (x_1, y_1, x_2, y_2)):
         raise BadInputError("waypoints are not all finite numbers")
-    farthest = float(np.abs(array).max())
+    farthest = max(abs(x_1), abs(y_1), abs(x_2), abs(y_2))
     if farthest > WAYPOINT_DISTANCE_LIMITS_M[1]:
         raise BadInputError(
             f"a waypoint {farthest:g} m away is out of sight: give metres in the robot's frame, at most "
             f"{WAYPOINT_DISTANCE_LIMITS_M[1]:g}"
         )
-    (x_1, y_1), (x_2, y_2) = array.tolist()
     return (x_1, y_1), (x_2, y_2)
 
 
@@ -161,7 +176,7 @@ def _array(value: Any, shape: tuple[int, ...] | None, name: str) -> NDArray[np.f
         array = np.asarray(value)
         if array.dtype.kind not in "fiub":
             raise BadInputError(f"{name} are not numbers")
-        array = array.astype(np.float64)
+        array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError, OverflowError) as error:
         raise BadInputError(f"{name} are not numbers") from error
     if shape is not None and array.shape != shape:

@@ -225,6 +225,6 @@ def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Run
     def judge(inputs: dict[str, Array]) -> tuple[Array, Array]:
         vectors, embedded = told(inputs)
         memories = theirs.step(inputs["range"][0], vectors, inputs["memories"][:, 0])
-        return critics.values(memories, inputs["action"][0], embedded).min(axis=0)[None], memories[:, None]
+        return critics.values(memories, inputs["action"][0], embedded)[None], memories[:, None]
 
     return [act, judge]

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from rcdsac_trl.deploy.sectors import BIN_RAD, Sectors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.interface import (
+    MAX_ANGULAR_ACCELERATION,
     MAX_ANGULAR_VELOCITY,
+    MAX_LINEAR_ACCELERATION,
     MAX_LINEAR_VELOCITY,
     MIN_LINEAR_VELOCITY,
     NUM_BINS,
-    clip_command,
 )
 
 # Shares of the wanted speed that are tried, the fastest first.
@@ -32,9 +33,15 @@ _LEAST_M = 0.01
 # Half the angle ahead (or behind) in which something must be sensed at all before the robot moves that way.
 _WAY_RAD = math.radians(30.0)
 
-_BORDERS = np.arange(NUM_BINS) * BIN_RAD
-_COS, _SIN = np.cos(_BORDERS), np.sin(_BORDERS)
-_MIDDLES = (_BORDERS + math.pi) % (2.0 * math.pi) - math.pi + BIN_RAD / 2.0
+# Below, the robot stands.
+_STANDS_M_PER_S = 1e-9
+_TWICE_BRAKING = 2.0 * MAX_LINEAR_ACCELERATION
+
+_ANGLES = np.arange(NUM_BINS) * BIN_RAD
+# Border i is the one between sectors i - 1 and i.
+_BORDERS = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)))
+_SECTORS_BEFORE = np.arange(NUM_BINS) - 1
+_MIDDLES = (_ANGLES + math.pi) % (2.0 * math.pi) - math.pi + BIN_RAD / 2.0
 _AHEAD = np.abs(_MIDDLES) < _WAY_RAD
 _BEHIND = np.abs(_MIDDLES) > math.pi - _WAY_RAD
 
@@ -97,42 +104,88 @@ class Guard:
         reason = None if (v, omega) == (fast, turning) else "the speed limit"
         if v == 0.0:
             return v, omega, reason
-        if not self.blind_reverse and not sectors.covered[_AHEAD if v > 0.0 else _BEHIND].any():
+        if not self.blind_reverse and not np.count_nonzero(sectors.covered[_AHEAD if v > 0.0 else _BEHIND]):
             return 0.0, omega, f"nothing senses what lies {'ahead' if v > 0 else 'behind'}"
-        for share in _SHARES:
-            if self._keeps_distance(share * v, omega, sectors, moving):
-                return share * v, omega, reason if share == 1.0 else "the stop zone"
-        return 0.0, omega, "the stop zone"
+        share = self._fastest(v, omega, sectors, moving)
+        if share == 0.0:
+            return 0.0, omega, "the stop zone"
+        return share * v, omega, reason if share == 1.0 else "the stop zone"
 
-    def _keeps_distance(self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float]) -> bool:
-        places = self._way(v, omega, moving)
+    def _fastest(self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float]) -> float:
+        """Return the largest of the shares of `v` whose way keeps its distance, 0 if none does."""
+        # Along a border, both sectors beside it are seen: whatever is inside a sector lies between its borders, at its
+        # distance or farther.
+        nearest = np.minimum(sectors.distances_m, sectors.distances_m[_SECTORS_BEFORE])
         # What is out of reach of the whole way cannot be near to any of it.
-        reach = float(np.abs(places).sum(axis=1).max()) + self.radius_m + self.margin_m
-        seen = np.flatnonzero(sectors.distances_m < reach)
-        if not len(seen):
-            return True
-        # Both borders of a sector: whatever is inside it lies between them, at its distance or farther.
-        borders = np.concatenate((seen, (seen + 1) % NUM_BINS))
-        near = np.concatenate((sectors.distances_m[seen],) * 2)
-        x, y = _COS[borders], _SIN[borders]
-        along = np.maximum(places @ np.stack((x, y)), near)
-        apart = np.square(places[:, :1] - along * x) + np.square(places[:, 1:] - along * y)
-        clearance = np.sqrt(apart.min(axis=1)) - self.radius_m
-        needed = min(self.margin_m, max(clearance[0] - _BLUR_M, _LEAST_M), clearance[0])
-        return bool((clearance >= needed).all())
+        seen = nearest < self._reach(max(abs(v), abs(moving[0])))
+        if not np.count_nonzero(seen):
+            return 1.0
+        clearance = _distances(self._ways(v, omega, moving), _BORDERS[:, seen], nearest[seen]) - self.radius_m
+        now = float(clearance[0, 0])
+        needed = min(self.margin_m, max(now - _BLUR_M, _LEAST_M), now)
+        least = clearance.min(axis=1).tolist()
+        return next((share for share, left in zip(_SHARES, least, strict=True) if left >= needed), 0.0)
 
-    def _way(self, v: float, omega: float, moving: tuple[float, float]) -> NDArray[np.float64]:
-        """Return the places the robot's centre comes by until it stands, itself first, [n, 2]."""
-        x = y = yaw = 0.0
-        v_now, omega_now = moving
-        places = [(0.0, 0.0)]
-        left = math.ceil(self.reaction_s / _STEP_S - 1e-9)
-        while left > 0 or abs(v_now) > 1e-9:
-            wanted = (v, omega) if left > 0 else (0.0, 0.0)
-            v_now, omega_now = clip_command(*wanted, v_now, omega_now, _STEP_S)
-            yaw += omega_now * _STEP_S / 2.0
-            x, y = x + v_now * _STEP_S * math.cos(yaw), y + v_now * _STEP_S * math.sin(yaw)
-            yaw += omega_now * _STEP_S / 2.0
-            places.append((x, y))
-            left -= 1
-        return np.array(places)
+    def _reach(self, speed: float) -> float:
+        """Return how near to here, m, something must be to matter to who is never faster than `speed`."""
+        return self.radius_m + self.margin_m + speed * (self.reaction_s + _STEP_S) + speed**2 / _TWICE_BRAKING
+
+    def _ways(self, v: float, omega: float, moving: tuple[float, float]) -> NDArray[np.float64]:
+        """Return the places the robot's centre comes by until it stands, itself first, for each share of `v`.
+
+        Returns:
+            [shares, n, 2], m; who stands before the others do stays where it is.
+        """
+        reacting = math.ceil(self.reaction_s / _STEP_S - 1e-9)
+        speeds = [_until_it_stands(share * v, moving[0], reacting) for share in _SHARES]
+        steps = max(len(of_share) for of_share in speeds)
+        covered_m = np.array([of_share + [0.0] * (steps - len(of_share)) for of_share in speeds]) * _STEP_S
+        places = np.zeros((len(_SHARES), steps + 1, 2))
+        # The turn does not depend on the speed.
+        np.cumsum(covered_m[:, :, None] * _directions(omega, moving[1], reacting, steps), axis=1, out=places[:, 1:])
+        return places
+
+
+def _until_it_stands(v: float, now: float, reacting: int) -> list[float]:
+    """Return the linear velocity in each step: `v` is wanted in the first ones, and to stand from then on."""
+    speeds: list[float] = []
+    while len(speeds) < reacting or abs(now) > _STANDS_M_PER_S:
+        now = _nearer(v if len(speeds) < reacting else 0.0, now, MAX_LINEAR_ACCELERATION * _STEP_S)
+        speeds.append(now)
+    return speeds
+
+
+def _directions(omega: float, now: float, reacting: int, steps: int) -> NDArray[np.float64]:
+    """Return cosine and sine of the mean direction in each step, [steps, 2]; see :func:`_until_it_stands`."""
+    yaw, directions = 0.0, []
+    for step in range(steps):
+        now = _nearer(omega if step < reacting else 0.0, now, MAX_ANGULAR_ACCELERATION * _STEP_S)
+        half = now * _STEP_S / 2.0
+        directions.append((math.cos(yaw + half), math.sin(yaw + half)))
+        yaw += 2.0 * half
+    return np.array(directions)
+
+
+def _nearer(wanted: float, now: float, change: float) -> float:
+    """Return the velocity after a step, as ``interface.clip_command`` has it, of one of the two alone."""
+    return now + change if wanted > now + change else now - change if wanted < now - change else wanted
+
+
+def _distances(
+    places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how far each place is from what is sensed, m, [...].
+
+    Args:
+        places: [..., 2].
+        borders: directions of unit length, [2, m].
+        nearest: in each direction, how far from here on there may be something, m, [m].
+    """
+    along = places @ borders
+    point = np.maximum(along, nearest)
+    # |place - point u|^2 = |place|^2 + point (point - 2 place u) for a direction u, in few passes over large arrays.
+    along *= 2.0
+    np.subtract(point, along, out=along)
+    along *= point
+    squared = along.min(axis=-1) + np.square(places).sum(axis=-1)
+    return np.sqrt(np.maximum(squared, 0.0))

@@ -139,7 +139,7 @@ class Actor:
 
 
 class Critics:
-    """Memories and an action to quantiles of the return, or to its mean, of all critics of an agent at once.
+    """Memories and an action to quantiles of the return, or to its mean: of all critics' the lower ones.
 
     Args:
         weights: of the agent.
@@ -159,7 +159,7 @@ class Critics:
             self._gate = np.concatenate([_cosines(float(tau), self._angles) for tau in fractions]) @ weight + bias
 
     def values(self, memories: Array, action: Array, embedded: float | None) -> Array:
-        """Return the quantiles [C, N], or the means [C, 1] of scalar critics.
+        """Return the lower of the critics' quantiles each, [N], or of scalar critics' means, [1].
 
         Args:
             memories: of each critic, [C, memory].
@@ -176,7 +176,9 @@ class Critics:
                 gate = gate + _cosines(embedded, self._angles) @ self._beta
             x = x * np.maximum(gate, _ZERO)
         weight, bias = self._output
-        return (_rectified(x, self._hidden) @ weight + bias)[:, :, 0]
+        values = _rectified(x, self._hidden) @ weight
+        values += bias
+        return np.minimum.reduce(values)[:, 0]
 
 
 def _rectified(x: Array, layer: tuple[Array, Array]) -> Array:

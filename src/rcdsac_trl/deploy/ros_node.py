@@ -1,7 +1,7 @@
 """A ROS 2 node around :class:`~rcdsac_trl.deploy.driver.Driver`; the one file that needs ``rclpy``.
 
 Run it where ROS 2 is sourced: ``python -m rcdsac_trl.deploy.ros_node --ros-args -p agent:=<name or folder>``.
-It reads ``scan``, ``odom`` and ``path``, writes ``cmd_vel`` (``geometry_msgs/TwistStamped``) and the return's quantiles
+It reads ``scan``, ``odom`` and ``plan``, writes ``cmd_vel`` (``geometry_msgs/TwistStamped``) and the return's quantiles
 on ``return_quantiles``. ``beta`` and ``stop`` may be set while it runs.
 """
 
@@ -42,7 +42,7 @@ class PolicyNode(Node):
         self._set([self.get_parameter("beta"), self.get_parameter("stop")])
         self.create_subscription(LaserScan, "scan", self.driver.on_scan, qos_profile_sensor_data)
         self.create_subscription(Odometry, "odom", self.driver.on_odometry, qos_profile_sensor_data)
-        self.create_subscription(Path, "path", self.driver.on_path, 1)
+        self.create_subscription(Path, "plan", self.driver.on_path, 1)
         self._commands = self.create_publisher(TwistStamped, "cmd_vel", 1)
         self._quantiles = self.create_publisher(Float32MultiArray, "return_quantiles", 1)
         self._said: str | None = None

@@ -15,6 +15,7 @@ BODY_RADIUS_M = 0.2
 """What is nearer to the robot's centre is the robot itself: nothing else gets inside an octagon of 0.25 m, whose sides
 are 0.23 m away."""
 
+_NUMBER = int | float | np.number
 # Angles come as float32 and are multiples of an increment: a border itself must not fall to the wrong side.
 _BORDER_RAD = 2e-6
 
@@ -58,7 +59,7 @@ class Mount:
 def is_finite_number(value: object) -> bool:
     """Tell whether something is one finite number, whatever it may be."""
     try:
-        return isinstance(value, int | float | np.number) and math.isfinite(float(value))
+        return isinstance(value, _NUMBER) and math.isfinite(float(value))
     except (OverflowError, TypeError):
         return False
 
