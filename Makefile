@@ -8,6 +8,11 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c c
 # Programs of benchmarks/, in the order they run.
 BENCHMARKS := deploy learner collection evaluation whole_job scaling_learner scaling_world
 
+# Tests run side by side, a worker a core; a file's tests stay together, since they share what they have trained.
+# Files begin in the order of tests/conftest.py: those that take longest first.
+WORKERS ?= logical
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
 .PHONY: setup train smoke test test-slow check format bench notebooks clean
 
 train: setup
@@ -17,10 +22,11 @@ smoke: setup
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow preset=smoke
 
 test: setup
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
-test-slow: setup
-	$(BIN)/python -m pytest -m "slow or not slow"
+# One after another: they start clusters of their own, and count on the cores.
+test-slow: test
+	$(BIN)/python -m pytest -m slow
 
 bench: setup
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py || exit 1; done

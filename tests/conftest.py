@@ -1,16 +1,46 @@
 """Shared by all tests."""
 
+import os
 import sys
 import traceback
 from contextlib import redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
 
+# Small tensors: a second thread costs more than it brings, and far more while tests run side by side. What tests start
+# inherits it, NumPy reads it as it is imported.
+os.environ["OMP_NUM_THREADS"] = "1"
+
 import pytest
 import torch
 
-# Small tensors: a second thread costs more than it brings, and far more while tests run side by side.
 torch.set_num_threads(1)
+
+# Side by side, whole files are given out in this order: those that take longest first, so that no worker is left with
+# one of them when there is nothing else to do.
+LONGEST = (
+    "test_notebooks",
+    "test_trainer",
+    "test_resume",
+    "test_sweep",
+    "test_wheel",
+    "test_evaluation",
+    "test_faults",
+    "test_cli",
+    "test_config",
+    "test_docs",
+    "test_env",
+    "test_networks",
+    "test_benchmarks",
+    "test_policies",
+    "test_teams",
+    "test_course",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONGEST)))
 
 
 @pytest.fixture(scope="session")

