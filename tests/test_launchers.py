@@ -19,7 +19,7 @@ from rcdsac_trl.world.env import resolve_num_workers
 
 # A job whose console says how many cores it was given, and one that fails at once; neither imports torch.
 TELLS = ("--cfg", "job", "--resolve", f"+share=${{oc.env:{SHARE},all}}")
-FAILS = ("+algo=ppo",)
+FAILS = ("--ppo",)  # no option
 
 
 def launcher(name: str, *overrides: str) -> Launcher:
@@ -41,7 +41,7 @@ def check_two_jobs(folder: Path, launcher: Launcher, share: str) -> None:
     with pytest.raises(FaultError) as caught:
         Sweep(folder, "two", jobs, launcher).run()
     told = str(caught.value)
-    assert told.startswith("1 of 2 runs failed, the same call continues them: fails: exit code 2: algo=ppo does not ex")
+    assert told.startswith("1 of 2 runs failed, the same call continues them: fails: exit code 2: there is no option ")
     assert [job.state.name for job in jobs] == ["failed", "finished"]
     assert share_told(jobs[1].folder) == share
 

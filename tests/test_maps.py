@@ -1,7 +1,6 @@
 import json
 import math
 import re
-import subprocess
 import sys
 from collections import defaultdict
 from dataclasses import fields, replace
@@ -332,10 +331,14 @@ def test_contact_sheet_draws_every_map() -> None:
         assert len(axes.patches) == len(map_.boxes) + len(map_.cylinders) + len(map_.movers) + 1
 
 
-def test_draw_maps_writes_the_picture_and_nothing_else(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "rcdsac_trl.draw_maps", "out=maps.png", "count=1", "map=static"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "drew 1 maps: maps.png"
+def test_draw_maps_writes_the_picture_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else it starts this process again
+    monkeypatch.setattr(sys, "argv", ["draw_maps", "out=maps.png", "count=1", "map=static"])
+    draw_maps.main()
+    assert capsys.readouterr().out.strip() == "drew 1 maps: maps.png"
     assert [path.name for path in tmp_path.iterdir()] == ["maps.png"]
     with Image.open(tmp_path / "maps.png") as image:
         assert min(image.size) > 300
