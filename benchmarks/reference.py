@@ -221,6 +221,8 @@ class ReferenceLoss(LossModule):
             return None
         steps = 1 if self.settings.fractions_per == "sequence" else current.shape[1]
         drawn = torch.rand((current.shape[0], steps, number), generator=self.generator)
+        if self.settings.fraction_sampling == "stratified":
+            drawn = (drawn + torch.arange(number)) / number
         return drawn.expand(*current.shape, number)
 
     def _error(self, value: Tensor, target: Tensor, tau: Tensor | None) -> Tensor:

@@ -100,6 +100,7 @@ def test_preset_paper_is_the_papers_table_of_hyper_parameters() -> None:
     assert (learner.batch_size, learner.sequence_length, learner.burn_in) == (100, 64, 0)
     assert learner.max_grad_norm is None
     assert (learner.resample_per, learner.fractions_per) == ("transition", "transition")
+    assert learner.fraction_sampling == "uniform"
     assert settings.replay.capacity_steps == 5_000_000
     assert (schedule.iterations, schedule.updates_per_iteration) == (500, 200)
     assert (schedule.pursuit_iterations, schedule.neutral_iterations, schedule.ramp_iterations) == (0, 0, 0)

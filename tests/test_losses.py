@@ -383,6 +383,21 @@ def test_fractions_per_transition_and_per_sequence() -> None:
     assert shapes == {"sequence": (3, 1, 7), "transition": (3, 4, 7)}
 
 
+def test_stratified_fractions_fall_into_a_part_each_and_are_uniform_in_it() -> None:
+    loss = make_loss(fraction_sampling="stratified", num_quantiles=7, num_target_quantiles=4, num_risk_samples=2)
+    batch = make_batch().repeat(400, 1)
+    draws = loss.draw(batch)
+    for fractions, number in ((draws.tau, 7), (draws.next_tau, 4), (draws.risk_tau, 2)):
+        assert fractions is not None
+        assert fractions.shape == (1200, 1, number)
+        within = number * fractions - torch.arange(number)
+        assert bool(((within >= -1e-6) & (within <= 1 + 1e-6)).all())
+        # Of 1,200 uniform numbers the mean lies within 0.5 +- 6 x 0.289 / sqrt(1200), the variance near 1/12.
+        assert (within.mean((0, 1)) - 0.5).abs().max() < 0.05
+        assert (within.var((0, 1)) - 1 / 12).abs().max() < 0.015
+    assert torch.isfinite(loss(batch)["loss_qvalue"])
+
+
 def test_current_and_next_step_share_their_transitions_beta() -> None:
     """Beta of slot t must act on the transition from t to t+1 and on no other."""
     batch = make_batch(steps=4)
@@ -573,6 +588,7 @@ def test_state_dict_continues_bit_for_bit() -> None:
         ({"kappa": -1.0}, "above 0"),
         ({"burn_in": -1}, "at least 0"),
         ({"fractions_per": "batch"}, "'sequence' or 'transition'"),
+        ({"fraction_sampling": "sobol"}, "'uniform' or 'stratified'"),
         ({"target_over_critics": "maximum"}, "one of minimum, smaller, mean"),
         ({"loss_function": "l3"}, "'smooth_l1' or 'l2'"),
         ({"reduction": "median"}, "'mean', 'sum' or 'none'"),

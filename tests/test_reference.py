@@ -99,6 +99,7 @@ def test_losses_and_gradients_equal_the_plain_ones(kind: str, per: str, kept: sl
     fast.target_over_critics = {"dsac": "mean", "sac": "smaller"}.get(
         kind, "smaller" if per == "sequence" else "minimum"
     )
+    fast.fraction_sampling = "stratified" if per == "sequence" else "uniform"
     # The plain losses draw float32 noise as the product does; the generators start equal.
     plain = load_reference().ReferenceLoss(fast, torch.Generator().manual_seed(3)).double()
     SoftUpdate(plain, eps=0.99)

@@ -5,7 +5,7 @@ So whoever computes the loss in parts gives each sequence the numbers that it ha
 Public names::
 
     Draws(next_noise, next_tau, tau, noise, risk_tau)       a NamedTuple; .rows(slice) -> those of some sequences
-    draw(action [B,L,A], numbers | None, fractions_per, generator) -> Draws
+    draw(action [B,L,A], numbers | None, fractions_per, fraction_sampling, generator) -> Draws
 """
 
 from typing import NamedTuple
@@ -40,13 +40,20 @@ class Draws(NamedTuple):
         return Draws(self.next_noise[sequences], next_tau, tau, self.noise[sequences], risk_tau)
 
 
-def draw(action: Tensor, numbers: tuple[int, int, int] | None, fractions_per: str, generator: torch.Generator) -> Draws:
+def draw(
+    action: Tensor,
+    numbers: tuple[int, int, int] | None,
+    fractions_per: str,
+    fraction_sampling: str,
+    generator: torch.Generator,
+) -> Draws:
     """Draw what a batch needs, on the generator's device, and bring it to the batch's.
 
     Args:
         action: ``[B, L, A]``; gives sizes, device and type.
         numbers: of the fractions of target, prediction and risk-adjusted value; None for scalar critics.
         fractions_per: anew for every ``"transition"``, or once a ``"sequence"``.
+        fraction_sampling: ``"uniform"`` on [0, 1), or ``"stratified"``: one in each of as many equal parts of [0, 1).
         generator: source of all numbers.
     """
 
@@ -57,6 +64,9 @@ def draw(action: Tensor, numbers: tuple[int, int, int] | None, fractions_per: st
         if numbers is None:
             return None
         shape = (len(action), 1 if fractions_per == "sequence" else action.shape[1], numbers[which])
-        return torch.rand(shape, generator=generator, device=generator.device).to(action.device)
+        drawn = torch.rand(shape, generator=generator, device=generator.device).to(action.device)
+        if fraction_sampling == "stratified":
+            drawn = (drawn + torch.arange(numbers[which], device=action.device)) / numbers[which]
+        return drawn
 
     return Draws(noise(), fractions(0), fractions(1), noise(), fractions(2))

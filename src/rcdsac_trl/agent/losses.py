@@ -3,8 +3,8 @@ r"""Distributional soft actor-critic on sequences: critic, actor and temperature
 Public names::
 
     DistributionalSACLoss(actor, critics, *, measure=None, num_quantiles=16, num_target_quantiles=16,
-                          num_risk_samples=16, fractions_per="sequence", kappa=1.0, loss_function="smooth_l1",
-                          alpha_init=1.0, target_entropy=-2.0, burn_in=0, target_over_critics="minimum",
+                          num_risk_samples=16, fractions_per="sequence", fraction_sampling="uniform",
+                          kappa=1.0, loss_function="smooth_l1", alpha_init=1.0, target_entropy=-2.0, burn_in=0, target_over_critics="minimum",
                           reduction="mean", generator=None)
         forward(batch [B, L+1]) -> loss_actor, loss_qvalue, loss_alpha, alpha, entropy, td_error, q_value
                                    (, quantile_spread)
@@ -69,6 +69,10 @@ class DistributionalSACLoss(LinkedLoss):
         num_risk_samples: K, fractions of the risk-adjusted value.
         fractions_per: draw fractions anew for every ``"transition"``, or once a ``"sequence"``; each term of the
             loss has the same distribution, but the gates of a sequence are then computed once.
+        fraction_sampling: ``"uniform"`` draws a set of fractions independently; ``"stratified"`` draws one in each of
+            as many equal parts of [0, 1]. A loss's sum over a set has the same expectation, but a stratified set misses
+            no part of the return: the variance of the mean of N falls with :math:`N^{-3}` where quantiles are smooth,
+            not :math:`N^{-1}`.
         kappa: threshold of the Huber loss.
         loss_function: error of scalar critics, ``"smooth_l1"`` or ``"l2"``, as in TorchRL's SAC.
         alpha_init: temperature at the start, above 0.
@@ -112,6 +116,7 @@ class DistributionalSACLoss(LinkedLoss):
         num_target_quantiles: int = 16,
         num_risk_samples: int = 16,
         fractions_per: Literal["sequence", "transition"] = "sequence",
+        fraction_sampling: Literal["uniform", "stratified"] = "uniform",
         kappa: float = 1.0,
         loss_function: Literal["smooth_l1", "l2"] = "smooth_l1",
         alpha_init: float = 1.0,
@@ -133,6 +138,8 @@ class DistributionalSACLoss(LinkedLoss):
             raise ValueError(f"burn_in = {burn_in} must be at least 0")
         if fractions_per not in ("sequence", "transition"):
             raise ValueError(f"fractions_per = {fractions_per!r} must be 'sequence' or 'transition'")
+        if fraction_sampling not in ("uniform", "stratified"):
+            raise ValueError(f"fraction_sampling = {fraction_sampling!r} must be 'uniform' or 'stratified'")
         if loss_function not in ("smooth_l1", "l2"):
             raise ValueError(f"loss_function = {loss_function!r} must be 'smooth_l1' or 'l2'")
         if target_over_critics not in OVER_CRITICS:
@@ -148,6 +155,7 @@ class DistributionalSACLoss(LinkedLoss):
         self.num_target_quantiles = num_target_quantiles
         self.num_risk_samples = num_risk_samples
         self.fractions_per = fractions_per
+        self.fraction_sampling = fraction_sampling
         self.kappa = kappa
         self.loss_function = loss_function
         self.target_entropy = target_entropy
@@ -208,7 +216,8 @@ class DistributionalSACLoss(LinkedLoss):
         """Draw all random numbers that a batch ``[B, L+1]`` needs."""
         numbers = (self.num_target_quantiles, self.num_quantiles, self.num_risk_samples)
         action = tensordict.get(self.tensor_keys.action)[:, self.burn_in : -1]
-        return draw(action, numbers if self._distributional else None, self.fractions_per, self._generator)
+        sampling = self.fractions_per, self.fraction_sampling
+        return draw(action, numbers if self._distributional else None, *sampling, self._generator)
 
     def encode_actor(self, tensordict: TensorDictBase) -> Tensor:
         """Return the actor's memory of every observation, ``[B, L + 1 - burn_in, memory]``."""

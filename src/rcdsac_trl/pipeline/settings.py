@@ -17,6 +17,7 @@ Conditioning = Literal["per_episode", "fixed", "none"]
 Relabel = Literal["resample", "stored"]
 OverCritics = Literal["minimum", "smaller", "mean"]
 DrawnPer = Literal["transition", "sequence"]
+FractionSampling = Literal["uniform", "stratified"]
 
 
 def _one_of(key: str, value: object, literal: object) -> None:
@@ -213,6 +214,7 @@ class LearnerSettings:
     num_target_quantiles: int
     num_risk_samples: int
     fractions_per: DrawnPer
+    fraction_sampling: FractionSampling
     kappa: float
     num_critics: int
     target_over_critics: OverCritics
@@ -234,6 +236,7 @@ class LearnerSettings:
         _one_of("learner.target_over_critics", self.target_over_critics, OverCritics)
         _one_of("learner.resample_per", self.resample_per, DrawnPer)
         _one_of("learner.fractions_per", self.fractions_per, DrawnPer)
+        _one_of("learner.fraction_sampling", self.fraction_sampling, FractionSampling)
         if self.num_critics not in (1, 2):
             raise UserInputError(f"learner.num_critics={self.num_critics} is neither 1 nor 2: use one of them")
         if not 0 <= self.burn_in < self.sequence_length:

@@ -35,6 +35,7 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
         num_target_quantiles=learner.num_target_quantiles,
         num_risk_samples=learner.num_risk_samples,
         fractions_per=learner.fractions_per,
+        fraction_sampling=learner.fraction_sampling,
         kappa=learner.kappa,
         alpha_init=learner.alpha_init,
         target_entropy=learner.target_entropy,
