@@ -155,7 +155,7 @@ class _ObservationFeatures(torch.autograd.Function):
         taps = w1[:, 0].t().contiguous().numpy()
         heard, silent = _divided(w3, positions, w2.shape[0])
         silent_1 = b1.relu()
-        silent_2 = torch.addmv(b2, kernel.t(), silent_1.repeat(_SEEN)).relu_()
+        silent_2 = torch.addmv(b2, kernel.t(), torch.cat([silent_1] * _SEEN)).relu_()
         widths = [len(b3), *(len(bias) for bias in others[1::2])]
         result = bins.new_empty(len(bins), sum(widths))
         range_features, *vector_features = result.split(widths, dim=1)
@@ -200,7 +200,7 @@ class _ObservationFeatures(torch.autograd.Function):
         # What the silent positions add to the linear layer's bias, backwards.
         d_silent_2 = (silent.t() @ d_b3).mul_(silent_2 > 0)
         d_silent_1 = (kernel @ d_silent_2).view(_SEEN, channels).sum(0).mul_(silent_1 > 0)
-        d_kernel.addr_(silent_1.repeat(_SEEN), d_silent_2)
+        d_kernel.addr_(torch.cat([silent_1] * _SEEN), d_silent_2)
         d_w3 = bins.new_empty(ctx.shape_3)
         d_by_position, d_heard = d_w3.view(len(d_b3), -1, channels), d_heard.view(len(d_b3), -1, channels)
         _unite(d_by_position.numpy(), positions, d_heard.numpy(), d_b3.numpy(), silent_2.numpy())

@@ -3,9 +3,9 @@ r"""Distributional soft actor-critic on sequences: critic, actor and temperature
 Public names::
 
     DistributionalSACLoss(actor, critics, *, measure=None, num_quantiles=16, num_target_quantiles=16,
-                          num_risk_samples=16, fractions_per="sequence", fraction_sampling="uniform",
-                          kappa=1.0, loss_function="smooth_l1", alpha_init=1.0, target_entropy=-2.0, burn_in=0, target_over_critics="minimum",
-                          reduction="mean", generator=None)
+                          num_risk_samples=16, fractions_per="sequence", fraction_sampling="uniform", kappa=1.0,
+                          loss_function="smooth_l1", alpha_init=1.0, target_entropy=-2.0, burn_in=0,
+                          target_over_critics="minimum", reduction="mean", generator=None)
         forward(batch [B, L+1]) -> loss_actor, loss_qvalue, loss_alpha, alpha, entropy, td_error, q_value
                                    (, quantile_spread)
         .make_value_estimator(gamma=0.99)   .set_keys(...)   .rng_state (get and set; also in state_dict)

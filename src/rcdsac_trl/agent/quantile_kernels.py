@@ -10,6 +10,7 @@ Public names::
     quantile_values(x [B,L,H], tau [B,L|1,N], beta [B,L|1,H], frequencies [C], gate [H,C], hidden, output) -> [B,L,N]
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -159,17 +160,18 @@ class _QuantileValues(torch.autograd.Function):
         cosines = _Room(x, longest, (shared, number, len(frequencies)), keep_all=ctx.needs_input_grad[4])
         tau_gate = _Room(x, longest, (shared, number, size), keep_all=keep)
         hidden = _Room(x, most, (steps, number, len(weight)), keep_all=keep)
+        features, offsets, values = x.numpy(), beta.numpy(), result.numpy()
         parameters = bias.numpy(), out_weight.view(-1).numpy(), out_bias.numpy()
         for gated in gate_blocks:
-            torch.mul(tau[gated].unsqueeze(-1), frequencies, out=cosines.of(gated)).cos_()
+            angles = torch.mul(tau[gated].unsqueeze(-1), frequencies)
+            torch.cos(angles.flatten(0, 2), out=cosines.rows(gated))
+            torch.mm(cosines.rows(gated), gate_weight.t(), out=tau_gate.rows(gated))
             gates = tau_gate.of(gated)
-            torch.mm(cosines.of(gated).flatten(0, 2), gate_weight.t(), out=gates.flatten(0, 2))
             for part in _blocks(range(sequences)[gated], steps * number):
-                products, rows = product.of(part), hidden.of(part).flatten(0, 2)
                 among = slice(part.start - gated.start, part.stop - gated.start)
-                _multiply(x[part].numpy(), gates[among].numpy(), beta[part].numpy(), products.numpy())
-                torch.mm(products.flatten(0, 2), weight.t(), out=rows)
-                _output(rows.numpy(), *parameters, result[part].view(-1).numpy())
+                _multiply(features[part], gates[among], offsets[part], product.of(part))
+                torch.mm(product.rows(part), weight.t(), out=hidden.rows(part))
+                _output(_flat(hidden.of(part)), *parameters, values[part].reshape(-1))
         if keep:
             ctx.save_for_backward(x, beta, gate_weight, weight, out_weight, cosines.data, tau_gate.data, hidden.data)
         return result
@@ -179,11 +181,12 @@ class _QuantileValues(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         x, beta, gate_weight, weight, out_weight, cosines, tau_gate, hidden = ctx.saved_tensors
         gradient = gradient.contiguous()
+        slopes, features, gates, offsets = gradient.numpy(), x.numpy(), tau_gate.numpy(), beta.numpy()
         # The output layer's weight is the same for every row: it goes into the matrices instead of the rows.
-        slopes = out_weight.view(-1, 1)
-        through = weight * slopes
+        column = out_weight.view(-1, 1)
+        through = weight * column
         if not ctx.needs_input_grad[5]:
-            return _gradient_of_features(gradient, x, beta, through, tau_gate, hidden), *[None] * 8
+            return _gradient_of_features(x, through, slopes, hidden.numpy(), gates, offsets), *[None] * 8
         (sequences, steps, number), shared = gradient.shape, tau_gate.shape[1]
         d_x, d_beta, d_gate_weight = torch.zeros_like(x), torch.zeros_like(beta), torch.zeros_like(gate_weight)
         d_weight, d_bias, d_out_weight = torch.zeros_like(weight), x.new_zeros(len(weight)), x.new_zeros(len(weight))
@@ -191,37 +194,44 @@ class _QuantileValues(torch.autograd.Function):
         most = _blocks(range(sequences), steps * number)[0].stop
         d_gate = _Room(x, gate_blocks[0].stop, tau_gate.shape[1:])
         product, d_hidden = _Room(x, most, (steps, number, x.shape[2])), _Room(x, most, hidden.shape[1:])
+        active, d_features, d_offsets = hidden.numpy(), d_x.numpy(), d_beta.numpy()
+        sums = d_bias.numpy(), d_out_weight.numpy()
         for gated in gate_blocks:
-            d_gates = d_gate.of(gated).zero_()
+            d_gates = d_gate.of(gated)
+            d_gates.fill(0)
             for part in _blocks(range(sequences)[gated], steps * number):
-                products, d_rows = product.of(part), d_hidden.of(part).flatten(0, 2)
-                rows, out = hidden[part].flatten(0, 2).numpy(), gradient[part].view(-1).numpy()
-                _output_gradient(out, rows, d_rows.numpy(), d_bias.numpy(), d_out_weight.numpy())
-                torch.mm(d_rows, through, out=products.flatten(0, 2))
+                d_rows, products = d_hidden.rows(part), product.rows(part)
+                _output_gradient(slopes[part].reshape(-1), _flat(active[part]), _flat(d_hidden.of(part)), *sums)
+                torch.mm(d_rows, through, out=products)
                 among = slice(part.start - gated.start, part.stop - gated.start)
-                arrays = x[part], tau_gate[part], beta[part], d_x[part], d_gates[among], d_beta[part]
-                _product_gradient(products.numpy(), *(value.numpy() for value in arrays))
-                d_weight.addmm_(d_rows.t(), products.flatten(0, 2))
-            d_gate_weight.addmm_(d_gates.flatten(0, 2).t(), cosines[gated].flatten(0, 2))
-        d_weight, d_bias = d_weight.mul_(slopes), d_bias.mul_(slopes.view(-1))
+                arrays = (
+                    features[part],
+                    gates[part],
+                    offsets[part],
+                    d_features[part],
+                    d_gates[among],
+                    d_offsets[part],
+                )
+                _product_gradient(product.of(part), *arrays)
+                d_weight.addmm_(d_rows.t(), products)
+            d_gate_weight.addmm_(d_gate.rows(gated).t(), cosines[gated].flatten(0, 2))
+        d_weight, d_bias = d_weight.mul_(column), d_bias.mul_(out_weight.view(-1))
         d_output = d_out_weight.view_as(out_weight), gradient.sum().view(1)
         return d_x, None, d_beta, None, d_gate_weight, d_weight, d_bias, *d_output
 
 
 def _gradient_of_features(
-    gradient: Tensor, x: Tensor, beta: Tensor, through: Tensor, tau_gate: Tensor, hidden: Tensor
+    x: Tensor, through: Tensor, slopes: np.ndarray, hidden: np.ndarray, gates: np.ndarray, offsets: np.ndarray
 ) -> Tensor:
     """Return the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
-    sequences, steps, number = gradient.shape
+    sequences, steps, number = slopes.shape
     d_x, blocks = torch.zeros_like(x), _blocks(range(sequences), steps * number)
-    most = blocks[0].stop * steps
-    d_product, d_hidden = x.new_empty(most, number, x.shape[2]), x.new_empty(most, number, hidden.shape[3])
+    most, d_features = blocks[0].stop * steps, d_x.numpy()
+    d_product, d_hidden = _Room(x, most, (number, x.shape[2])), _Room(x, most, (number, hidden.shape[3]))
     for part in blocks:
-        slopes = gradient[part].numpy()
-        sloping = _sloping_gradient(slopes, hidden[part].numpy(), d_hidden.numpy())
-        torch.mm(d_hidden[:sloping].flatten(0, 1), through, out=d_product[:sloping].flatten(0, 1))
-        gates = tau_gate[part].numpy(), beta[part].numpy()
-        _features_gradient(slopes, d_product.numpy(), *gates, d_x[part].numpy())
+        sloping = slice(0, _sloping_gradient(slopes[part], hidden[part], d_hidden.array))
+        torch.mm(d_hidden.rows(sloping), through, out=d_product.rows(sloping))
+        _features_gradient(slopes[part], d_product.array, gates[part], offsets[part], d_features[part])
     return d_x
 
 
@@ -235,6 +245,9 @@ def _blocks(sequences: range, rows: int) -> list[slice]:
 class _Room:
     """Room ``[sequences, *shape]`` for one block after another, or for all sequences, which then keep their places.
 
+    It is an array for compiled passes and a matrix of rows for products: a slice of a tensor, or a tensor made an
+    array, takes longer than some of the passes.
+
     Args:
         x: features ``[B, L, H]``.
         block: sequences of a block.
@@ -244,11 +257,23 @@ class _Room:
 
     def __init__(self, x: Tensor, block: int, shape: Sequence[int], *, keep_all: bool = False) -> None:
         self.data = x.new_empty(len(x) if keep_all else block, *shape)
+        self.array = self.data.numpy()
+        self._rows, self._each = self.data.flatten(0, -2), math.prod(shape[:-1])
         self._keep_all = keep_all
 
-    def of(self, part: slice) -> Tensor:
+    def of(self, part: slice) -> np.ndarray:
         """Return the room for these sequences."""
-        return self.data[part] if self._keep_all else self.data[: part.stop - part.start]
+        return self.array[part] if self._keep_all else self.array[: part.stop - part.start]
+
+    def rows(self, part: slice) -> Tensor:
+        """Return it as rows, ``[rows, size]``."""
+        first = part.start if self._keep_all else 0
+        return self._rows[first * self._each : (first + part.stop - part.start) * self._each]
+
+
+def _flat(array: np.ndarray) -> np.ndarray:
+    """Return all but the last dimension as one."""
+    return array.reshape(-1, array.shape[-1])
 
 
 def quantile_values(

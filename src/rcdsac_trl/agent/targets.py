@@ -1,13 +1,16 @@
-"""The target critics' step.
+"""The steps of the target critics and of the averaged actor.
 
 Public names::
 
     FusedSoftUpdate(loss, *, eps | tau)     TorchRL's SoftUpdate, all parameters in one call
+    FusedAverage(model, decay)              torch's AveragedModel, exponential, its parameters listed once
 """
 
 from typing import Any
 
 import torch
+from torch import nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.objectives import LossModule, SoftUpdate
 
 
@@ -36,3 +39,30 @@ class FusedSoftUpdate(SoftUpdate):
         """Move every target towards its source."""
         targets, sources = zip(*self._pairs, strict=True)
         torch._foreach_lerp_(targets, sources, 1.0 - self.eps)
+
+
+class FusedAverage(AveragedModel):
+    r"""torch's ``AveragedModel``, :math:`\bar\theta \leftarrow d\,\bar\theta + (1 - d)\,\theta`, in one call.
+
+    The original lists and groups the parameters of both at every step, which takes longer than the arithmetic. Make it
+    once the model is on its device; loading a state into either is fine at any time. Buffers stay what they are.
+
+    Args:
+        model: whose parameters are averaged; the first step copies them.
+        decay: d, in [0, 1).
+    """
+
+    def __init__(self, model: nn.Module, decay: float) -> None:
+        """Copy the model."""
+        super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        pairs = zip(self.module.parameters(), model.parameters(), strict=True)
+        self._averaged, self._followed = zip(*((mine.data, theirs.data) for mine, theirs in pairs), strict=True)
+        self._weight = 1.0 - decay
+
+    def update_parameters(self, model: nn.Module) -> None:
+        """Move the averages towards the model's parameters; it must be the model this was made of."""
+        if self.n_averaged == 0:
+            super().update_parameters(model)
+            return
+        torch._foreach_lerp_(self._averaged, self._followed, self._weight)
+        self.n_averaged += 1

@@ -3,11 +3,12 @@
 import safetensors.torch
 import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictParams, TensorDictSequential
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule
 
 from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
 from rcdsac_trl.agent.losses import DistributionalSACLoss
+from rcdsac_trl.agent.targets import FusedAverage
 from rcdsac_trl.agent.transforms import Relabel
 from rcdsac_trl.pipeline.policies import AgentNoise, LeanPolicy, OnDevice
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
@@ -78,8 +79,7 @@ def make_actor(settings: TrainingSettings) -> TensorDictSequential:
 
 def make_average(loss: LossModule, learner: LearnerSettings) -> AveragedModel:
     """Make the running average of the actor's weights; it is what is validated, evaluated and deployed."""
-    decay = learner.actor_average_decay
-    return AveragedModel(loss.actor_network, multi_avg_fn=get_ema_multi_avg_fn(decay))
+    return FusedAverage(loss.actor_network, learner.actor_average_decay)
 
 
 def make_policy(actor: TensorDictSequential, noise: AgentNoise, device: str) -> TensorDictModuleBase:
