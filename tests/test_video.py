@@ -1,5 +1,6 @@
 """Films: right number of frames and size, what they show is what was measured, and nothing half-written."""
 
+import dataclasses
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -22,7 +23,8 @@ from rcdsac_trl.pipeline.film import Track, film
 from rcdsac_trl.pipeline.predictions import QuantilePredictor
 from rcdsac_trl.pipeline.recording import Moment
 from rcdsac_trl.pipeline.video import Frame, write_video
-from rcdsac_trl.world.render import FLOOR, MAPPED, TOUCHING
+from rcdsac_trl.pipeline.ways import ways
+from rcdsac_trl.world.render import FLOOR, MAPPED, ROBOT, TOUCHING
 from test_render import SIZE_M, scene
 from tiny import STEPS, evaluate, tiny_settings
 
@@ -135,6 +137,31 @@ def test_each_panel_shows_its_own_moment() -> None:
     assert touched == [[True, False], [False, True]]
 
 
+def test_ways_show_goals_and_contacts_where_they_were() -> None:
+    def at(x: float, y: float, collisions: int = 0, goals: int = 0) -> Moment:
+        where = dataclasses.replace(scene(), pose=(x, y, 0.0), waypoints=np.array([[14.0, 8.0]]))
+        return moment(scene=where, collisions=collisions, goals=goals)
+
+    free = Track("a", [at(2.5, 10.0), at(4.5, 10.0), at(6.5, 10.0)])
+    hit = Track("b", [at(2.5, 10.0), at(4.5, 10.0, collisions=1), at(6.5, 10.0, 1), at(8.5, 10.0, 1, goals=1)])
+    picture = ways([free, hit])
+    side, head = 560, 56
+    assert picture.shape == (side + 3 * head, 2 * side, 3)
+    scale = side / (1.04 * SIZE_M)
+
+    def color(panel: int, x: float, y: float) -> tuple[int, ...]:
+        return tuple(picture[head + int((1.02 * SIZE_M - y) * scale), panel * side + int((x + 0.02 * SIZE_M) * scale)])
+
+    assert (color(0, 2.5, 10.1), color(1, 2.5, 10.1)) == (ROBOT, ROBOT)
+    assert color(0, 4.5, 10.15) == FLOOR
+    assert color(1, 4.5, 10.15) == TOUCHING
+    assert color(1, 6.5, 10.15) == FLOOR  # the same contact
+    assert color(0, 13.7, 8.2) == FLOOR  # not reached
+    assert color(1, 13.7, 8.2) != FLOOR
+    texts = [(picture[head + side : 2 * head + side, i * side : (i + 1) * side] == TOUCHING).all(-1) for i in (0, 1)]
+    assert [bool(text.any()) for text in texts] == [False, True]
+
+
 # ------------------------------------------------------------------------------------------------ of an evaluation
 @pytest.fixture(scope="module")
 def run(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -152,7 +179,7 @@ def test_an_evaluation_films_what_it_measured(run: Path, tmp_path: Path, monkeyp
     )
     assert {path.name for path in out.iterdir()} == {
         *("episodes.csv", "summary.csv", "evaluation.json"),
-        *("video-map1-episode1.mp4", "video-map1-episode1.gif"),
+        *("video-map1-episode1.mp4", "video-map1-episode1.gif", "ways-map1-episode1.png"),
     }
     number, height, width, _ = frames_of(out / "video-map1-episode1.mp4").shape
     assert (number, width) == (STEPS, 2 * 640)

@@ -1,5 +1,6 @@
 """Frames to a film: an MP4 with all of them, and a small GIF for pages that show nothing else."""
 
+import contextlib
 import importlib.util
 import io
 import itertools
@@ -111,6 +112,8 @@ def _write_mp4(frames: Iterator[Frame], path: Path, fps: float) -> None:
             pass  # it says why below
         except BaseException:
             encoder.kill()
+            with contextlib.suppress(BrokenPipeError):  # what is not written yet
+                encoder.stdin.close()
             raise
         told = encoder.communicate()[1].decode(errors="replace")
     if encoder.returncode != 0:

@@ -129,10 +129,10 @@ def _sections(
             "Who is better than whom",
             [
                 *(figure for name, figure in figures.items() if name.startswith("differences")),
-                "`better` is the probability that an episode of the first agent beats one of the second on the same "
-                "map (fewer collisions, more reward). p-values: sign permutations over maps, adjusted by Holm's method "
-                "for the number of pairs. With one training seed they speak of these trained agents, not of the "
-                "algorithms.",
+                "The column better is the probability that an episode of the first agent beats one of the second on "
+                "the same map (fewer collisions, more reward). p-values: sign permutations over maps, adjusted by "
+                "Holm's method for the number of pairs. With one training seed they speak of these trained agents, "
+                "not of the algorithms.",
                 _text(shown) if len(shown) else "There is only one agent.",
                 "All other pairs are in comparisons.csv.",
             ],

@@ -103,7 +103,7 @@ class Renderer:
         Returns:
             uint8 RGB, shape [size_px, size_px, 3].
         """
-        canvas = self._canvas(scene)
+        canvas = self._canvas(scene.map, scene.pose)
         _draw_lidar(canvas, scene)
         _draw_trail(canvas, scene.trail)
         _draw_path(canvas, scene)
@@ -114,26 +114,55 @@ class Renderer:
             self._write(canvas.image, caption)
         return np.asarray(canvas.image.reduce(self._fine))
 
-    def _canvas(self, scene: Scene) -> "_Canvas":
-        margin = 0.02 * scene.map.size_m
-        whole = scene.map.size_m + 2 * margin
+    def draw_way(
+        self,
+        map_: Map,
+        way: Sequence[tuple[float, float]],
+        goals: Sequence[tuple[float, float]],
+        touches: Sequence[tuple[float, float]],
+    ) -> np.ndarray:
+        """Draw where a robot has driven on a map, which a view of None shows as a whole.
+
+        Args:
+            map_: what stands.
+            way: its positions, oldest first, m.
+            goals: those it reached, numbered in this order.
+            touches: where it was when it began to touch something.
+
+        Returns:
+            uint8 RGB, shape [size_px, size_px, 3].
+        """
+        canvas = self._canvas(map_, way[-1])
+        for number, (x, y) in enumerate(goals, start=1):
+            canvas.disc(x, y, 0.42, (*GOAL, 60), GOAL, 0.06)
+            canvas.text(x, y, str(number), self._font)
+        _draw_trail(canvas, way)
+        x, y = way[0]
+        canvas.disc(x, y, 0.2, ROBOT, ROBOT_EDGE, 0.06)
+        for x, y in touches:
+            canvas.disc(x, y, 0.26, TOUCHING, (255, 255, 255), 0.05)
+        return np.asarray(canvas.image.reduce(self._fine))
+
+    def _canvas(self, map_: Map, centre: Sequence[float]) -> "_Canvas":
+        margin = 0.02 * map_.size_m
+        whole = map_.size_m + 2 * margin
         view = self._view_m or whole
         side = self._size_px * self._fine
         scale = side / view
-        if self._background is None or self._background[0] is not scene.map:
+        if self._background is None or self._background[0] is not map_:
             full = round(whole * scale)
             background = Image.new("RGB", (full, full), OUTSIDE)
-            _draw_map(_Canvas(background, scale, -margin, scene.map.size_m + margin), scene.map)
-            self._background = (scene.map, background)
+            _draw_map(_Canvas(background, scale, -margin, map_.size_m + margin), map_)
+            self._background = (map_, background)
         background = self._background[1]
         if self._view_m is None:
-            return _Canvas(background.copy(), scale, -margin, scene.map.size_m + margin)
+            return _Canvas(background.copy(), scale, -margin, map_.size_m + margin)
         # Snap the window to whole pixels of the background, and the frame's origin with it.
-        column = round((scene.pose[0] + margin) * scale - side / 2)
-        line = round((scene.map.size_m + margin - scene.pose[1]) * scale - side / 2)
+        column = round((centre[0] + margin) * scale - side / 2)
+        line = round((map_.size_m + margin - centre[1]) * scale - side / 2)
         window = Image.new("RGB", (side, side), OUTSIDE)
         window.paste(background, (-column, -line))
-        return _Canvas(window, scale, column / scale - margin, scene.map.size_m + margin - line / scale)
+        return _Canvas(window, scale, column / scale - margin, map_.size_m + margin - line / scale)
 
     def _write(self, image: Image.Image, caption: str) -> None:
         pad = 6 * self._fine
@@ -188,6 +217,9 @@ class _Canvas:
         r = radius * self._scale
         box = (column - r, line - r, column + r, line + r)
         self._draw.ellipse(box, fill, edge, 0 if edge is None else max(1, round(edge_m * self._scale)))
+
+    def text(self, x: float, y: float, text: str, font: ImageFont.FreeTypeFont) -> None:
+        self._draw.text(self.pixels(np.array([[x, y]]))[0], text, TEXT, font=font, anchor="mm")
 
     def line(self, points: np.ndarray, color: Color, width_m: float) -> None:
         if len(points) > 1:

@@ -1,12 +1,15 @@
-"""A film of an evaluation's episodes."""
+"""A film of an evaluation's episodes, and a picture of their ways."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
 from rcdsac_trl.interface import MOTOR_PERIOD_S
+from rcdsac_trl.pipeline import durable
 from rcdsac_trl.pipeline.build.agent import unpacked_loss
 from rcdsac_trl.pipeline.build.driver import Agent, Course, driver
 from rcdsac_trl.pipeline.film import Track, VideoSettings, film
@@ -15,13 +18,14 @@ from rcdsac_trl.pipeline.predictions import QuantilePredictor
 from rcdsac_trl.pipeline.recording import Moment, Recorder
 from rcdsac_trl.pipeline.teams import Team
 from rcdsac_trl.pipeline.video import write_video
+from rcdsac_trl.pipeline.ways import ways
 from rcdsac_trl.world.episode import draw_motor_steps
 
 
 def write_film(
     course: Course, agent: Agent | None, video: VideoSettings, headings: Sequence[str], folder: Path
 ) -> list[Path]:
-    """Drive the episodes of a map once more, and film one under every condition.
+    """Drive the episodes of a map once more, film one under every condition, and draw the ways driven.
 
     All agents drive again, so that those that are filmed do, bit by bit, what they did when they were measured.
 
@@ -39,7 +43,12 @@ def write_film(
     motor_steps = draw_motor_steps(course.world.task, course.split, course.seed, video.map, video.episode)
     named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]
     frames = tqdm(film(named, motor_steps * MOTOR_PERIOD_S), total=len(tracks[0]), unit="frame", disable=None)
-    return write_video(frames, folder / f"video-map{video.map}-episode{video.episode}", video.fps)
+    name = f"map{video.map}-episode{video.episode}"
+    films = write_video(frames, folder / f"video-{name}", video.fps)
+    picture = io.BytesIO()
+    Image.fromarray(ways(named)).save(picture, "png", optimize=True)
+    durable.write(folder / f"ways-{name}.png", picture.getvalue())
+    return [*films, folder / f"ways-{name}.png"]
 
 
 def recorded(course: Course, agent: Agent | None, map_index: int, episode: int) -> list[list[Moment]]:
