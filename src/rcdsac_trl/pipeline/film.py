@@ -27,11 +27,11 @@ from rcdsac_trl.world.render import (
 )
 
 # A film is at most four episodes wide, of which the fewer the larger.
-_COLUMNS = 4
+COLUMNS = 4
 _SIDES_PX = {1: 720, 2: 640, 3: 512}
 _SMALLEST_SIDE_PX = 480
-_PAPER = (255, 255, 255)
-_FAINT = (122, 130, 143)
+PAPER = (255, 255, 255)
+FAINT = (122, 130, 143)
 # How many times finer curves are drawn than shown.
 _FINE = 2
 # The worst of the return, marked in the panel of quantiles.
@@ -84,12 +84,12 @@ def film(tracks: Sequence[Track], period_s: float) -> Iterator[Frame]:
         tracks: episodes of equal length.
         period_s: of a step.
     """
-    columns = min(len(tracks), _COLUMNS)
+    columns = min(len(tracks), COLUMNS)
     lines = math.ceil(len(tracks) / columns)
     side = _SIDES_PX.get(columns, _SMALLEST_SIDE_PX)
     panel, renderer = _Panel(side, _limits(tracks)), Renderer(side)
     legend = _legend(columns * side, side)
-    sheet = Image.new("RGB", (columns * side, lines * panel.height + legend.height), _PAPER)
+    sheet = Image.new("RGB", (columns * side, lines * panel.height + legend.height), PAPER)
     sheet.paste(legend, (0, lines * panel.height))
     turned = [len({moment.beta for moment in track.moments}) > 1 for track in tracks]
     for step, moments in enumerate(zip(*(track.moments for track in tracks), strict=True)):
@@ -103,13 +103,13 @@ def film(tracks: Sequence[Track], period_s: float) -> Iterator[Frame]:
 def _legend(width: int, side: int) -> Image.Image:
     """Draw the line below all panels that says what colours mean."""
     size = 0.026 * side
-    image = Image.new("RGB", (width, 2 * round(size)), _PAPER)
+    image = Image.new("RGB", (width, 2 * round(size)), PAPER)
     draw, text = ImageDraw.Draw(image), font(size)
     left, middle = size, image.height / 2
     for name, color in _LEGEND.items():
         draw.ellipse((left, middle - size / 2, left + size, middle + size / 2), color)
         left += 1.5 * size
-        draw.text((left, middle), name, _FAINT, font=text, anchor="lm")
+        draw.text((left, middle), name, FAINT, font=text, anchor="lm")
         left += draw.textlength(name, font=text) + 2 * size
     return image
 
@@ -124,7 +124,8 @@ def _limits(tracks: Sequence[Track]) -> tuple[float, float] | None:
     return low - margin, high + margin
 
 
-def _counted(number: int, what: str) -> str:
+def counted(number: int, what: str) -> str:
+    """Return a number with the name of what it counts, as in ``"2 goals"``."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
@@ -147,22 +148,20 @@ class _Panel:
 
     def draw(self, heading: str, right: str, moment: Moment, renderer: Renderer) -> Image.Image:
         """Return the panel, [height, side], with two texts at its upper edge."""
-        image = Image.new("RGB", (self._side, self.height), _PAPER)
+        image = Image.new("RGB", (self._side, self.height), PAPER)
         image.paste(Image.fromarray(renderer.draw(moment.scene)), (0, self._head))
         draw = ImageDraw.Draw(image)
         middle = self._head // 2
         draw.text((self._pad, middle), heading, TEXT, font=self._large, anchor="lm")
-        draw.text((self._side - self._pad, middle), right, _FAINT, font=self._normal, anchor="rm")
+        draw.text((self._side - self._pad, middle), right, FAINT, font=self._normal, anchor="rm")
         middle = self._head + self._side + self._foot // 2
         speed = f"{moment.speed_m_per_s + 0.0:.2f} m/s"
         draw.text((self._pad, middle), speed, TEXT, font=self._normal, anchor="lm")
         hit = TOUCHING if moment.scene.in_contact else TEXT
         draw.text(
-            (0.42 * self._side, middle), _counted(moment.collisions, "collision"), hit, font=self._normal, anchor="lm"
+            (0.42 * self._side, middle), counted(moment.collisions, "collision"), hit, font=self._normal, anchor="lm"
         )
-        draw.text(
-            (self._side - self._pad, middle), _counted(moment.goals, "goal"), TEXT, font=self._normal, anchor="rm"
-        )
+        draw.text((self._side - self._pad, middle), counted(moment.goals, "goal"), TEXT, font=self._normal, anchor="rm")
         if self._limits is not None and moment.quantiles is not None:
             curve = self._quantiles(moment.quantiles, self._limits)
             image.paste(curve, (0, self._head + self._side + self._foot))
@@ -173,7 +172,7 @@ class _Panel:
         width, height = self._side * _FINE, self._curve * _FINE
         left, right = round(0.14 * width), width - self._pad * _FINE
         top, bottom = round(0.06 * height), round(0.80 * height)
-        image = Image.new("RGB", (width, height), _PAPER)
+        image = Image.new("RGB", (width, height), PAPER)
         draw = ImageDraw.Draw(image, "RGBA")
         low, high = limits
 
@@ -188,7 +187,7 @@ class _Panel:
         draw.polygon([(points[0][0], bottom), *points, (points[-1][0], bottom)], SEEN)
         draw.line(points, HIT, 2 * _FINE, joint="curve")
         if low < 0 < high:
-            draw.line((left, line_of(0), right, line_of(0)), _FAINT, _FINE)
+            draw.line((left, line_of(0), right, line_of(0)), FAINT, _FINE)
         for value in (quantiles[0], quantiles[-1]):
             draw.line((left - 4 * _FINE, line_of(value), left, line_of(value)), HIT, _FINE)
         lowest, highest = line_of(quantiles[0]), line_of(quantiles[-1])
@@ -196,5 +195,5 @@ class _Panel:
         for value, line in ((quantiles[0], lowest + apart), (quantiles[-1], highest - apart)):
             draw.text((left - 6 * _FINE, line), f"{value:.1f}", TEXT, font=self._small, anchor="rm")
         caption = "return from here on, by fraction (red: the worst tenth)"
-        draw.text(((left + right) / 2, (bottom + height) / 2), caption, _FAINT, font=self._small, anchor="mm")
+        draw.text(((left + right) / 2, (bottom + height) / 2), caption, FAINT, font=self._small, anchor="mm")
         return image.reduce(_FINE)
