@@ -41,5 +41,7 @@ def test_a_decay_of_zero_is_the_model_itself() -> None:
     average = FusedAverage(model, decay=0.0)
     for _ in range(3):
         moved(model)
+        changes = average.module.weight._version
         average.update_parameters(model)
         assert torch.equal(average.module.weight, model.weight)
+        assert average.module.weight._version > changes  # what acts with the average reads this count

@@ -55,8 +55,9 @@ class FusedAverage(AveragedModel):
     def __init__(self, model: nn.Module, decay: float) -> None:
         """Copy the model."""
         super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
-        pairs = zip(self.module.parameters(), model.parameters(), strict=True)
-        self._averaged, self._followed = zip(*((mine.data, theirs.data) for mine, theirs in pairs), strict=True)
+        # Detached, not `.data`: the compiled actor sees by PyTorch's count of changes that its weights have moved.
+        self._averaged = tuple(parameter.detach() for parameter in self.module.parameters())
+        self._followed = tuple(parameter.detach() for parameter in model.parameters())
         self._weight = 1.0 - decay
 
     def update_parameters(self, model: nn.Module) -> None:
