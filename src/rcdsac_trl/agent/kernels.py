@@ -1,15 +1,14 @@
 r"""An observation's layers up to the recurrent one on a CPU, with their backward pass written out.
 
 They compute exactly what ordinary layers do (tests hold them against those, and against finite differences) and exist
-because on a CPU an update spends its time moving memory and calling operations, not multiplying. Here a batch goes
-through the range observation's layers in blocks that stay in the cache; what is not a matrix product is one compiled
-pass; all layers write into one array of features; and bins that are silent in the whole batch, such as those a
-narrow sensor lacks, are left out.
+because on a CPU an update spends its time moving memory and calling operations, not multiplying. Here the range
+observation's layers are one compiled pass, matrix products included, in which a batch goes through them in blocks that
+stay in the cache; all layers write into one array of features; and bins that are silent in the whole batch, such as
+those a narrow sensor lacks, are left out.
 
 Public names::
 
     observation_features(bins [n,180], vectors [n,k].., (conv_1, conv_2, linear), layers) -> [n, features]
-    rectify(rows, bias)     adds the bias and rectifies in place; compiled
 """
 
 from collections.abc import Sequence
@@ -20,6 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from rcdsac_trl.agent.products import times, times_transposed, transposed_times
 
 # Windows of the second convolution that go through the layers together: their inputs and activations take some 2 MB.
 _ROWS_PER_BLOCK = 96 * 43
@@ -32,7 +33,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"c
 
 
 @_compiled
-def rectify(rows: np.ndarray, bias: np.ndarray) -> None:
+def _rectify(rows: np.ndarray, bias: np.ndarray) -> None:
     """Add the bias to every row and rectify, in place."""
     zero = rows.dtype.type(0)
     for r in range(rows.shape[0]):
@@ -138,6 +139,69 @@ def _unite(
                     row[c] = d_bias[f] * value[c]
 
 
+@_compiled
+def _range_layers(
+    bins: np.ndarray,
+    positions: np.ndarray,
+    taps: np.ndarray,
+    bias_1: np.ndarray,
+    kernel: np.ndarray,
+    bias_2: np.ndarray,
+    heard: np.ndarray,
+    windows: np.ndarray,
+    activations: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Write the second convolution's activations and the linear layer's product with them."""
+    number = positions.size
+    size = windows.shape[0] // number
+    for start in range(0, bins.shape[0], size):
+        stop = min(start + size, bins.shape[0])
+        window, rows = windows[: (stop - start) * number], activations[start * number : stop * number]
+        _first_layer(bins[start:stop], positions, taps, bias_1, window)
+        times(window, kernel, rows, False)
+        _rectify(rows, bias_2)
+        times_transposed(rows.reshape(stop - start, -1), heard, out[start:stop], False)
+
+
+@_compiled
+def _range_gradient(
+    gradient: np.ndarray,
+    bins: np.ndarray,
+    positions: np.ndarray,
+    taps: np.ndarray,
+    bias_1: np.ndarray,
+    kernel: np.ndarray,
+    heard: np.ndarray,
+    windows: np.ndarray,
+    activations: np.ndarray,
+    d_taps: np.ndarray,
+    d_bias_1: np.ndarray,
+    d_kernel: np.ndarray,
+    d_bias_2: np.ndarray,
+    d_heard: np.ndarray,
+) -> None:
+    """Add the gradients of all that the range layers read but the bins."""
+    number, zero = positions.size, bins.dtype.type(0)
+    size = windows.shape[0] // number
+    d_windows, d_activations = np.empty_like(windows), np.empty_like(activations[: size * number])
+    for start in range(0, bins.shape[0], size):
+        stop = min(start + size, bins.shape[0])
+        window, d_window = windows[: (stop - start) * number], d_windows[: (stop - start) * number]
+        rows, d_rows = activations[start * number : stop * number], d_activations[: (stop - start) * number]
+        transposed_times(gradient[start:stop], rows.reshape(stop - start, -1), d_heard, True)
+        times(gradient[start:stop], heard, d_rows.reshape(stop - start, -1), False)
+        for r in range(rows.shape[0]):
+            row, d_row = rows[r], d_rows[r]
+            for c in range(row.size):
+                d_row[c] = d_row[c] if row[c] > zero else zero
+                d_bias_2[c] += d_row[c]
+        _first_layer(bins[start:stop], positions, taps, bias_1, window)
+        transposed_times(window, d_rows, d_kernel, True)
+        times_transposed(d_rows, kernel, d_window, False)
+        _first_layer_gradient(bins[start:stop], positions, window, d_window, d_taps, d_bias_1)
+
+
 # ------------------------------------------------------------------------------------------------ features
 class _ObservationFeatures(torch.autograd.Function):
     """Convolution 5/2, convolution 3/2, linear layer over the bins; a linear layer for every vector; all rectified.
@@ -161,15 +225,11 @@ class _ObservationFeatures(torch.autograd.Function):
         range_features, *vector_features = result.split(widths, dim=1)
         activations = bins.new_empty(len(bins) * len(positions), w2.shape[0])
         windows = _window_buffer(bins, positions, kernel)
-        for rows, block in _blocks(len(bins), len(positions)):
-            window = windows[: rows.stop - rows.start]
-            _first_layer(bins[block].numpy(), positions, taps, b1.numpy(), window.numpy())
-            torch.mm(window, kernel, out=activations[rows])
-            rectify(activations[rows].numpy(), b2.numpy())
-            torch.mm(activations[rows].view(-1, heard.shape[1]), heard.t(), out=range_features[block])
+        layers = (value.numpy() for value in (b1, kernel, b2, heard, windows, activations, range_features))
+        _range_layers(bins.numpy(), positions, taps, *layers)
         for vector, weight, out in zip(vectors, others[::2], vector_features, strict=True):
             torch.mm(vector, weight.t(), out=out)
-        rectify(result.numpy(), torch.cat((torch.addmv(b3, silent, silent_2), *others[1::2])).numpy())
+        _rectify(result.numpy(), torch.cat((torch.addmv(b3, silent, silent_2), *others[1::2])).numpy())
         ctx.save_for_backward(bins, w1, b1, kernel, heard, silent, silent_1, silent_2, activations, result, *vectors)
         ctx.positions, ctx.taps, ctx.widths, ctx.shape_3 = positions, taps, widths, w3.shape
         return result
@@ -185,18 +245,9 @@ class _ObservationFeatures(torch.autograd.Function):
         d_w1, d_b1, d_b2 = bins.new_zeros(w1.shape[2], channels), torch.zeros_like(b1), torch.zeros_like(b1)
         d_kernel, d_heard = torch.zeros_like(kernel), torch.zeros_like(heard)
         windows = _window_buffer(bins, positions, kernel)
-        d_windows = torch.empty_like(windows)
-        for rows, block in _blocks(len(bins), len(positions)):
-            window, d_window = windows[: rows.stop - rows.start], d_windows[: rows.stop - rows.start]
-            d_heard.addmm_(d_features[block].t(), activations[rows].view(-1, heard.shape[1]))
-            d_rows = torch.mm(d_features[block], heard).view(-1, channels)
-            torch.ops.aten.threshold_backward.grad_input(d_rows, activations[rows], 0, grad_input=d_rows)
-            d_b2 += d_rows.sum(0)
-            _first_layer(bins[block].numpy(), positions, taps, b1.numpy(), window.numpy())
-            d_kernel.addmm_(window.t(), d_rows)
-            torch.mm(d_rows, kernel.t(), out=d_window)
-            arrays = window.numpy(), d_window.numpy(), d_w1.numpy(), d_b1.numpy()
-            _first_layer_gradient(bins[block].numpy(), positions, *arrays)
+        layers = (value.numpy() for value in (b1, kernel, heard, windows, activations))
+        gradients = (value.numpy() for value in (d_w1, d_b1, d_kernel, d_b2, d_heard))
+        _range_gradient(d_features.numpy(), bins.numpy(), positions, taps, *layers, *gradients)
         # What the silent positions add to the linear layer's bias, backwards.
         d_silent_2 = (silent.t() @ d_b3).mul_(silent_2 > 0)
         d_silent_1 = (kernel @ d_silent_2).view(_SEEN, channels).sum(0).mul_(silent_1 > 0)
@@ -223,18 +274,10 @@ def _divided(w3: Tensor, positions: np.ndarray, channels: int) -> tuple[Tensor, 
     return heard.flatten(1), silent
 
 
-def _blocks(observations: int, positions: int) -> list[tuple[slice, slice]]:
-    """Cut the observations into blocks; return the rows and the observations of each."""
-    size = max(1, _ROWS_PER_BLOCK // positions)
-    starts = range(0, observations, size)
-    blocks = [slice(start, min(start + size, observations)) for start in starts]
-    return [(slice(block.start * positions, block.stop * positions), block) for block in blocks]
-
-
 def _window_buffer(bins: Tensor, positions: np.ndarray, kernel: Tensor) -> Tensor:
-    """Return room for a block's windows."""
-    rows = _blocks(len(bins), len(positions))[0][0]
-    return bins.new_empty(rows.stop, len(kernel))
+    """Return room for the windows of a block of whole observations."""
+    observations = min(len(bins), max(1, _ROWS_PER_BLOCK // len(positions)))
+    return bins.new_empty(observations * len(positions), len(kernel))
 
 
 def observation_features(

@@ -2,16 +2,14 @@ r"""The quantile critics' hot pieces on a CPU, each with its backward pass writt
 
 They compute exactly what ordinary layers do (tests hold them against those, and against finite differences). A batch
 of 6,400 transitions has 100,000 quantiles: as ordinary layers, every gate, product and activation of theirs is 50
-MB that goes to main memory and back between two operations. Here rows go through all layers in blocks that stay in the
-cache; the products are torch's matrix products, and what lies between two of them is one compiled pass.
+MB that goes to main memory and back between two operations. Here one compiled pass takes rows through all layers, matrix
+products included, in blocks that stay in the cache.
 
 Public names::
 
     quantile_values(x [B,L,H], tau [B,L|1,N], beta [B,L|1,H], frequencies [C], gate [H,C], hidden, output) -> [B,L,N]
 """
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -19,6 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from rcdsac_trl.agent.products import times, times_transposed, transposed_times
 
 # Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
 _ROWS_PER_BLOCK = 1024
@@ -131,6 +131,106 @@ def _product_gradient(
                     out[h] = features[h] * opened
 
 
+@_compiled
+def _layers(
+    x: np.ndarray,
+    cosines: np.ndarray,
+    beta: np.ndarray,
+    gate_weight: np.ndarray,
+    weight: np.ndarray,
+    bias: np.ndarray,
+    out_weight: np.ndarray,
+    out_bias: np.ndarray,
+    tau_gate: np.ndarray,
+    hidden: np.ndarray,
+    values: np.ndarray,
+) -> None:
+    """Write the gates, the hidden layer and the values; hidden may have room for some sequences alone."""
+    sequences, steps, number = values.shape
+    times_transposed(_rows(cosines), gate_weight, _rows(tau_gate), False)
+    size = _block(steps * number, sequences)
+    product = np.empty((size, steps, number, x.shape[2]), x.dtype)
+    for start in range(0, sequences, size):
+        stop = min(start + size, sequences)
+        first = start if hidden.shape[0] >= sequences else 0
+        inner, factors = _rows(hidden[first : first + stop - start]), product[: stop - start]
+        _multiply(x[start:stop], tau_gate[start:stop], beta[start:stop], factors)
+        times_transposed(_rows(factors), weight, inner, False)
+        _output(inner, bias, out_weight, out_bias, values[start:stop].reshape(-1))
+
+
+@_compiled
+def _layers_gradient(
+    slopes: np.ndarray,
+    x: np.ndarray,
+    cosines: np.ndarray,
+    beta: np.ndarray,
+    tau_gate: np.ndarray,
+    hidden: np.ndarray,
+    through: np.ndarray,
+    d_x: np.ndarray,
+    d_beta: np.ndarray,
+    d_gate_weight: np.ndarray,
+    d_weight: np.ndarray,
+    d_bias: np.ndarray,
+    d_out_weight: np.ndarray,
+) -> None:
+    """Add the gradients of all layers; those of weight and bias lack the output's weight, a factor of each row."""
+    sequences, steps, number = slopes.shape
+    size = _block(steps * number, sequences)
+    product, d_hidden = np.empty((size, steps, number, x.shape[2]), x.dtype), np.empty_like(hidden[:size])
+    d_tau_gate = np.zeros_like(tau_gate)
+    for start in range(0, sequences, size):
+        stop = min(start + size, sequences)
+        factors, d_inner = product[: stop - start], _rows(d_hidden[: stop - start])
+        _output_gradient(slopes[start:stop].reshape(-1), _rows(hidden[start:stop]), d_inner, d_bias, d_out_weight)
+        times(d_inner, through, _rows(factors), False)
+        _product_gradient(
+            factors,
+            x[start:stop],
+            tau_gate[start:stop],
+            beta[start:stop],
+            d_x[start:stop],
+            d_tau_gate[start:stop],
+            d_beta[start:stop],
+        )
+        transposed_times(d_inner, _rows(factors), d_weight, True)
+    transposed_times(_rows(d_tau_gate), _rows(cosines), d_gate_weight, True)
+
+
+@_compiled
+def _gradient_of_features(
+    slopes: np.ndarray,
+    beta: np.ndarray,
+    tau_gate: np.ndarray,
+    hidden: np.ndarray,
+    through: np.ndarray,
+    d_x: np.ndarray,
+) -> None:
+    """Add the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
+    sequences, steps, number = slopes.shape
+    size = _block(steps * number, sequences)
+    d_hidden = np.empty((size * steps, number, hidden.shape[3]), hidden.dtype)
+    d_product = np.empty((size * steps, number, d_x.shape[2]), d_x.dtype)
+    for start in range(0, sequences, size):
+        stop = min(start + size, sequences)
+        sloping = _sloping_gradient(slopes[start:stop], hidden[start:stop], d_hidden)
+        times(_rows(d_hidden[:sloping]), through, _rows(d_product[:sloping]), False)
+        _features_gradient(slopes[start:stop], d_product, tau_gate[start:stop], beta[start:stop], d_x[start:stop])
+
+
+@_compiled
+def _block(rows: int, sequences: int) -> int:
+    """Return how many sequences of so many rows each go through the layers together."""
+    return min(sequences, max(1, _ROWS_PER_BLOCK // rows))
+
+
+@_compiled
+def _rows(array: np.ndarray) -> np.ndarray:
+    """Return all but the last dimension as one."""
+    return array.reshape(array.size // array.shape[-1], array.shape[-1])  # -1 cannot be inferred of no rows
+
+
 # ------------------------------------------------------------------------------------------------ quantile values
 class _QuantileValues(torch.autograd.Function):
     """``output(relu(hidden(x * relu(gate @ cos(frequencies * tau) + beta))))``.
@@ -153,27 +253,24 @@ class _QuantileValues(torch.autograd.Function):
         out_bias: Tensor,
     ) -> Tensor:
         (sequences, steps, size), (shared, number) = x.shape, tau.shape[1:]
-        result, keep = x.new_empty(sequences, steps, number), any(ctx.needs_input_grad)
-        gate_blocks = _blocks(range(sequences), shared * number)
-        longest, most = gate_blocks[0].stop, _blocks(range(sequences), steps * number)[0].stop
-        product = _Room(x, most, (steps, number, size))
-        cosines = _Room(x, longest, (shared, number, len(frequencies)), keep_all=ctx.needs_input_grad[4])
-        tau_gate = _Room(x, longest, (shared, number, size), keep_all=keep)
-        hidden = _Room(x, most, (steps, number, len(weight)), keep_all=keep)
+        keep, blocks = any(ctx.needs_input_grad), _gate_blocks(tau)
+        gated = sequences if keep else blocks[0].stop
+        cosines = x.new_empty(gated, shared, number, len(frequencies))
+        tau_gate = x.new_empty(gated, shared, number, size)
+        # What nothing goes back through needs no place of its own.
+        inner = sequences if keep else min(blocks[0].stop, max(1, _ROWS_PER_BLOCK // (steps * number)))
+        hidden = x.new_empty(inner, steps, number, len(weight))
+        result = x.new_empty(sequences, steps, number)
+        layers = [value.numpy() for value in (gate_weight, weight, bias, out_weight.view(-1), out_bias)]
         features, offsets, values = x.numpy(), beta.numpy(), result.numpy()
-        parameters = bias.numpy(), out_weight.view(-1).numpy(), out_bias.numpy()
-        for gated in gate_blocks:
-            angles = torch.mul(tau[gated].unsqueeze(-1), frequencies)
-            torch.cos(angles.flatten(0, 2), out=cosines.rows(gated))
-            torch.mm(cosines.rows(gated), gate_weight.t(), out=tau_gate.rows(gated))
-            gates = tau_gate.of(gated)
-            for part in _blocks(range(sequences)[gated], steps * number):
-                among = slice(part.start - gated.start, part.stop - gated.start)
-                _multiply(features[part], gates[among], offsets[part], product.of(part))
-                torch.mm(product.rows(part), weight.t(), out=hidden.rows(part))
-                _output(_flat(hidden.of(part)), *parameters, values[part].reshape(-1))
+        for block in blocks:
+            place = block if keep else slice(0, block.stop - block.start)
+            torch.cos(tau[block].unsqueeze(-1) * frequencies, out=cosines[place])
+            given = features[block], cosines[place].numpy(), offsets[block]
+            rooms = tau_gate[place].numpy(), hidden[place].numpy() if keep else hidden.numpy()
+            _layers(*given, *layers, *rooms, values[block])
         if keep:
-            ctx.save_for_backward(x, beta, gate_weight, weight, out_weight, cosines.data, tau_gate.data, hidden.data)
+            ctx.save_for_backward(x, beta, gate_weight, weight, out_weight, cosines, tau_gate, hidden)
         return result
 
     @staticmethod
@@ -181,99 +278,30 @@ class _QuantileValues(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         x, beta, gate_weight, weight, out_weight, cosines, tau_gate, hidden = ctx.saved_tensors
         gradient = gradient.contiguous()
-        slopes, features, gates, offsets = gradient.numpy(), x.numpy(), tau_gate.numpy(), beta.numpy()
         # The output layer's weight is the same for every row: it goes into the matrices instead of the rows.
         column = out_weight.view(-1, 1)
         through = weight * column
+        d_x = torch.zeros_like(x)
         if not ctx.needs_input_grad[5]:
-            return _gradient_of_features(x, through, slopes, hidden.numpy(), gates, offsets), *[None] * 8
-        (sequences, steps, number), shared = gradient.shape, tau_gate.shape[1]
-        d_x, d_beta, d_gate_weight = torch.zeros_like(x), torch.zeros_like(beta), torch.zeros_like(gate_weight)
+            known = gradient, beta, tau_gate, hidden, through
+            _gradient_of_features(*(value.numpy() for value in (*known, d_x)))
+            return d_x, *[None] * 8
+        d_beta, d_gate_weight = torch.zeros_like(beta), torch.zeros_like(gate_weight)
         d_weight, d_bias, d_out_weight = torch.zeros_like(weight), x.new_zeros(len(weight)), x.new_zeros(len(weight))
-        gate_blocks = _blocks(range(sequences), shared * number)
-        most = _blocks(range(sequences), steps * number)[0].stop
-        d_gate = _Room(x, gate_blocks[0].stop, tau_gate.shape[1:])
-        product, d_hidden = _Room(x, most, (steps, number, x.shape[2])), _Room(x, most, hidden.shape[1:])
-        active, d_features, d_offsets = hidden.numpy(), d_x.numpy(), d_beta.numpy()
-        sums = d_bias.numpy(), d_out_weight.numpy()
-        for gated in gate_blocks:
-            d_gates = d_gate.of(gated)
-            d_gates.fill(0)
-            for part in _blocks(range(sequences)[gated], steps * number):
-                d_rows, products = d_hidden.rows(part), product.rows(part)
-                _output_gradient(slopes[part].reshape(-1), _flat(active[part]), _flat(d_hidden.of(part)), *sums)
-                torch.mm(d_rows, through, out=products)
-                among = slice(part.start - gated.start, part.stop - gated.start)
-                arrays = (
-                    features[part],
-                    gates[part],
-                    offsets[part],
-                    d_features[part],
-                    d_gates[among],
-                    d_offsets[part],
-                )
-                _product_gradient(product.of(part), *arrays)
-                d_weight.addmm_(d_rows.t(), products)
-            d_gate_weight.addmm_(d_gate.rows(gated).t(), cosines[gated].flatten(0, 2))
+        along = [value.numpy() for value in (gradient, x, cosines, beta, tau_gate, hidden)]
+        sums = [value.numpy() for value in (d_gate_weight, d_weight, d_bias, d_out_weight)]
+        for block in _gate_blocks(tau_gate):
+            written = d_x[block].numpy(), d_beta[block].numpy()
+            _layers_gradient(*(value[block] for value in along), through.numpy(), *written, *sums)
         d_weight, d_bias = d_weight.mul_(column), d_bias.mul_(out_weight.view(-1))
         d_output = d_out_weight.view_as(out_weight), gradient.sum().view(1)
         return d_x, None, d_beta, None, d_gate_weight, d_weight, d_bias, *d_output
 
 
-def _gradient_of_features(
-    x: Tensor, through: Tensor, slopes: np.ndarray, hidden: np.ndarray, gates: np.ndarray, offsets: np.ndarray
-) -> Tensor:
-    """Return the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
-    sequences, steps, number = slopes.shape
-    d_x, blocks = torch.zeros_like(x), _blocks(range(sequences), steps * number)
-    most, d_features = blocks[0].stop * steps, d_x.numpy()
-    d_product, d_hidden = _Room(x, most, (number, x.shape[2])), _Room(x, most, (number, hidden.shape[3]))
-    for part in blocks:
-        sloping = slice(0, _sloping_gradient(slopes[part], hidden[part], d_hidden.array))
-        torch.mm(d_hidden.rows(sloping), through, out=d_product.rows(sloping))
-        _features_gradient(slopes[part], d_product.array, gates[part], offsets[part], d_features[part])
-    return d_x
-
-
-def _blocks(sequences: range, rows: int) -> list[slice]:
-    """Cut the sequences of so many rows each into blocks."""
-    size = max(1, _ROWS_PER_BLOCK // rows)
-    starts = range(sequences.start, sequences.stop, size)
-    return [slice(start, min(start + size, sequences.stop)) for start in starts]
-
-
-class _Room:
-    """Room ``[sequences, *shape]`` for one block after another, or for all sequences, which then keep their places.
-
-    It is an array for compiled passes and a matrix of rows for products: a slice of a tensor, or a tensor made an
-    array, takes longer than some of the passes.
-
-    Args:
-        x: features ``[B, L, H]``.
-        block: sequences of a block.
-        shape: of a sequence's part.
-        keep_all: whether there is room for all.
-    """
-
-    def __init__(self, x: Tensor, block: int, shape: Sequence[int], *, keep_all: bool = False) -> None:
-        self.data = x.new_empty(len(x) if keep_all else block, *shape)
-        self.array = self.data.numpy()
-        self._rows, self._each = self.data.flatten(0, -2), math.prod(shape[:-1])
-        self._keep_all = keep_all
-
-    def of(self, part: slice) -> np.ndarray:
-        """Return the room for these sequences."""
-        return self.array[part] if self._keep_all else self.array[: part.stop - part.start]
-
-    def rows(self, part: slice) -> Tensor:
-        """Return it as rows, ``[rows, size]``."""
-        first = part.start if self._keep_all else 0
-        return self._rows[first * self._each : (first + part.stop - part.start) * self._each]
-
-
-def _flat(array: np.ndarray) -> np.ndarray:
-    """Return all but the last dimension as one."""
-    return array.reshape(-1, array.shape[-1])
+def _gate_blocks(gates: Tensor) -> list[slice]:
+    """Cut the sequences ``[B, L|1, N, ..]`` into blocks whose gates are computed together."""
+    size = max(1, _ROWS_PER_BLOCK // gates.shape[1:3].numel())
+    return [slice(start, min(start + size, len(gates))) for start in range(0, len(gates), size)]
 
 
 def quantile_values(

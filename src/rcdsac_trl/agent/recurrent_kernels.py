@@ -1,8 +1,8 @@
 r"""A gated recurrent layer that learns, on a CPU, its backward pass written out.
 
 It computes exactly what ``nn.GRU`` does (tests hold it against that, and against finite differences). Torch's own layer
-records some twenty operations a step for its backward pass, among them a matrix product for every weight. Here a step,
-forth or back, is one compiled pass and one matrix product, and whatever does not wait for another step is one matrix
+records some twenty operations a step for its backward pass, among them a matrix product for every weight. Here all steps,
+forth or back, are one compiled pass, with one matrix product a step; whatever does not wait for another step is one
 product over all of them.
 
 Public names::
@@ -19,6 +19,8 @@ import torch
 from numba.extending import overload
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from rcdsac_trl.agent.products import times, times_transposed, transposed_times
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
@@ -53,27 +55,28 @@ def _compiled_tanh(x: Any) -> Callable[[Any], Any]:
 
 # Rows are sliced into gates rather than indexed at an offset: only so does the compiler know that they are contiguous.
 @_compiled
-def _step(t: int, bias: np.ndarray, gates: np.ndarray, recurrent: np.ndarray, states: np.ndarray) -> None:
-    """Do step t: what input and state contribute to the gates becomes r, z, n, and ``U_n h + c``."""
-    half = states.dtype.type(0.5)
-    size = states.shape[2]
-    for b in range(states.shape[1]):
-        both, of_state = gates[t, b, : 2 * size], recurrent[t, b, : 2 * size]
+def _step(
+    gates: np.ndarray, recurrent: np.ndarray, b_in: np.ndarray, b_re: np.ndarray, before: np.ndarray, after: np.ndarray
+) -> None:
+    """Do a step: what input and state contribute to the gates becomes r, z, n, and ``U_n h + c``."""
+    half = before.dtype.type(0.5)
+    size = before.shape[1]
+    for b in range(before.shape[0]):
+        both, of_state = gates[b, : 2 * size], recurrent[b, : 2 * size]
         for i in range(both.size):
-            both[i] = half * _tanh(half * (both[i] + of_state[i] + bias[i])) + half  # the logistic function
-        r, z, n = gates[t, b, :size], gates[t, b, size : 2 * size], gates[t, b, 2 * size :]
-        inner, offset = recurrent[t, b, 2 * size :], bias[2 * size :]
+            both[i] = half * _tanh(half * (both[i] + of_state[i] + b_in[i] + b_re[i])) + half  # the logistic function
+        r, z, n = gates[b, :size], gates[b, size : 2 * size], gates[b, 2 * size :]
+        inner, offset, inner_offset = recurrent[b, 2 * size :], b_in[2 * size :], b_re[2 * size :]
         for i in range(size):
-            inner[i] += offset[i]
-            n[i] = _tanh(n[i] + r[i] * inner[i])
-        before, after = states[t, b], states[t + 1, b]
+            inner[i] += inner_offset[i]
+            n[i] = _tanh(n[i] + offset[i] + r[i] * inner[i])
+        old, new = before[b], after[b]
         for i in range(size):
-            after[i] = n[i] + z[i] * (before[i] - n[i])
+            new[i] = n[i] + z[i] * (old[i] - n[i])
 
 
 @_compiled
 def _step_gradient(
-    t: int,
     gradient: np.ndarray,
     carried: np.ndarray,
     gates: np.ndarray,
@@ -82,14 +85,14 @@ def _step_gradient(
     d_inputs: np.ndarray,
     d_recurrent: np.ndarray,
 ) -> None:
-    """Write step t's gradients before the gates' nonlinearities, and into ``carried`` what h gets through z."""
+    """Write a step's gradients before the gates' nonlinearities, and into ``carried`` what h gets through z."""
     one = states.dtype.type(1)
-    size = states.shape[2]
-    for b in range(states.shape[1]):
-        r, z, n = gates[t, b, :size], gates[t, b, size : 2 * size], gates[t, b, 2 * size :]
-        before, inner, out, d_h = states[t, b], recurrent[t, b, 2 * size :], gradient[t, b], carried[b]
-        d_r, d_z = d_inputs[t, b, :size], d_inputs[t, b, size : 2 * size]
-        d_n, d_inner = d_inputs[t, b, 2 * size :], d_recurrent[t, b, 2 * size :]
+    size = states.shape[1]
+    for b in range(states.shape[0]):
+        r, z, n = gates[b, :size], gates[b, size : 2 * size], gates[b, 2 * size :]
+        before, inner, out, d_h = states[b], recurrent[b, 2 * size :], gradient[b], carried[b]
+        d_r, d_z = d_inputs[b, :size], d_inputs[b, size : 2 * size]
+        d_n, d_inner = d_inputs[b, 2 * size :], d_recurrent[b, 2 * size :]
         for i in range(size):
             d_state = d_h[i] + out[i]
             d_n[i] = d_state * (one - z[i]) * (one - n[i] * n[i])
@@ -98,7 +101,61 @@ def _step_gradient(
         for i in range(size):
             d_r[i] = d_n[i] * inner[i] * r[i] * (one - r[i])
             d_inner[i] = d_n[i] * r[i]
-        d_recurrent[t, b, : 2 * size] = d_inputs[t, b, : 2 * size]
+        d_recurrent[b, : 2 * size] = d_inputs[b, : 2 * size]
+
+
+@_compiled
+def _steps(
+    x: np.ndarray,
+    w_in: np.ndarray,
+    w_re: np.ndarray,
+    b_in: np.ndarray,
+    b_re: np.ndarray,
+    gates: np.ndarray,
+    recurrent: np.ndarray,
+    states: np.ndarray,
+) -> None:
+    """Do all steps from the state 0."""
+    states[0], recurrent[0] = 0, 0
+    times_transposed(x, w_in, gates.reshape(x.shape[0], -1), False)
+    for t in range(gates.shape[0]):
+        if t > 0:
+            times_transposed(states[t], w_re, recurrent[t], False)
+        _step(gates[t], recurrent[t], b_in, b_re, states[t], states[t + 1])
+
+
+@_compiled
+def _steps_gradient(
+    gradient: np.ndarray,
+    x: np.ndarray,
+    w_in: np.ndarray,
+    w_re: np.ndarray,
+    gates: np.ndarray,
+    recurrent: np.ndarray,
+    states: np.ndarray,
+    d_x: np.ndarray,
+    d_w_in: np.ndarray,
+    d_w_re: np.ndarray,
+    d_b_in: np.ndarray,
+    d_b_re: np.ndarray,
+) -> None:
+    """Write the gradients of the inputs and of the weights."""
+    d_inputs, d_recurrent, carried = np.empty_like(gates), np.empty_like(gates), np.zeros_like(states[0])
+    for t in range(len(gates) - 1, -1, -1):
+        _step_gradient(gradient[t], carried, gates[t], recurrent[t], states[t], d_inputs[t], d_recurrent[t])
+        if t > 0:
+            times(d_recurrent[t], w_re, carried, True)
+    rows, first, size = x.shape[0], states.shape[1], states.shape[2]
+    of_inputs, of_states = d_inputs.reshape(rows, -1), d_recurrent.reshape(rows, -1)
+    times(of_inputs, w_in, d_x, False)
+    transposed_times(of_inputs, x, d_w_in, False)
+    transposed_times(of_states[first:], states[1:-1].reshape(rows - first, size), d_w_re, False)
+    d_b_in[:], d_b_re[:] = 0, 0
+    for r in range(rows):
+        row, other = of_inputs[r], of_states[r]
+        for i in range(row.size):
+            d_b_in[i] += row[i]
+            d_b_re[i] += other[i]
 
 
 class _GatedRecurrence(torch.autograd.Function):
@@ -108,14 +165,10 @@ class _GatedRecurrence(torch.autograd.Function):
     def forward(ctx: Any, inputs: Tensor, w_in: Tensor, w_re: Tensor, b_in: Tensor, b_re: Tensor) -> Tensor:
         steps, rows, size = inputs.shape[0], inputs.shape[1], w_re.shape[1]
         x = inputs.reshape(steps * rows, -1)
-        gates = torch.addmm(b_in, x, w_in.t()).view(steps, rows, 3 * size)  # r, z, n; first of the inputs alone
-        states = inputs.new_empty(steps + 1, rows, size)
-        states[0].zero_()
-        recurrent, weight = torch.empty_like(gates), w_re.t().contiguous()
-        arrays = [value.numpy() for value in (b_re, gates, recurrent, states)]
-        for t, (before, product) in enumerate(zip(states[:-1].unbind(), recurrent.unbind(), strict=True)):
-            torch.mm(before, weight, out=product)
-            _step(t, *arrays)
+        gates = inputs.new_empty(steps, rows, 3 * size)  # r, z, n
+        recurrent, states = torch.empty_like(gates), inputs.new_empty(steps + 1, rows, size)
+        weights = w_in, w_re, b_in, b_re
+        _steps(*(value.numpy() for value in (x, *weights, gates, recurrent, states)))
         ctx.save_for_backward(x, w_in, w_re, gates, recurrent, states)
         return states[1:]
 
@@ -123,20 +176,11 @@ class _GatedRecurrence(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
         x, w_in, w_re, gates, recurrent, states = ctx.saved_tensors
-        steps, rows, size = gates.shape[0], gates.shape[1], states.shape[2]
-        d_inputs, d_recurrent = torch.empty_like(recurrent), torch.empty_like(recurrent)
-        carried = torch.zeros_like(states[0])
-        arrays = [value.numpy() for value in (carried, gates, recurrent, states, d_inputs, d_recurrent)]
-        out = gradient.contiguous().numpy()
-        for t in range(steps - 1, -1, -1):
-            _step_gradient(t, out, *arrays)
-            if t > 0:
-                carried.addmm_(d_recurrent[t], w_re)
-        d_inputs, d_recurrent = d_inputs.view(-1, 3 * size), d_recurrent.view(-1, 3 * size)
-        d_x = torch.mm(d_inputs, w_in).view(steps, rows, -1)
-        d_w_in = torch.mm(d_inputs.t(), x)
-        d_w_re = torch.mm(d_recurrent[rows:].t(), states[1:-1].reshape(-1, size))
-        return d_x, d_w_in, d_w_re, d_inputs.sum(0), d_recurrent.sum(0)
+        d_x, d_w_in, d_w_re = torch.empty_like(x), torch.empty_like(w_in), torch.empty_like(w_re)
+        d_b_in, d_b_re = w_in.new_empty(2, len(w_in))
+        known = gradient.contiguous(), x, w_in, w_re, gates, recurrent, states
+        _steps_gradient(*(value.numpy() for value in (*known, d_x, d_w_in, d_w_re, d_b_in, d_b_re)))
+        return d_x.view(*gates.shape[:2], -1), d_w_in, d_w_re, d_b_in, d_b_re
 
 
 def gated_recurrence(inputs: Tensor, gru: nn.GRU) -> Tensor:
