@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from rcdsac_trl.agent import kernels, quantile_kernels
+from rcdsac_trl.agent import kernels, quantile_kernels, quantile_values
 from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic, build_policy
 from rcdsac_trl.agent.networks import (
     FEW_OBSERVATIONS,
@@ -92,44 +92,57 @@ def test_gated_recurrence_against_finite_differences() -> None:
     assert torch.autograd.gradcheck(_GatedRecurrence.apply, (inputs, *gru.parameters()))
 
 
-def quantile_head(steps: int, tau_steps: int, risk_steps: int, *, frozen: bool) -> tuple[QuantileHead, list[Tensor]]:
-    """Make a head and its kernel's inputs: features, fractions, beta's part of the gate."""
-    head = QuantileHead(2, SMALL, PowerLaw()).double().requires_grad_(not frozen)
-    sequences = 1 + quantile_kernels._ROWS_PER_BLOCK // (4 * steps)  # more than a block of products
-    x = torch.randn(sequences, steps, SMALL.head, dtype=torch.float64, requires_grad=True)
+Inputs = tuple[Tensor, Tensor, Tensor, Tensor | None]
+
+
+def quantile_head(
+    steps: int, tau_steps: int, risk_steps: int | None, *, frozen: bool = False, sequences: int | None = None
+) -> tuple[QuantileHead, Inputs]:
+    """Make a head and its kernel's inputs: memory, action, fractions, beta's cosines (None: not conditioned on it)."""
+    head = QuantileHead(2, SMALL, None if risk_steps is None else PowerLaw()).double().requires_grad_(not frozen)
+    sequences = sequences or 1 + quantile_kernels.ROWS_PER_BLOCK // (4 * steps)  # more than a block of products
+    memory = torch.randn(steps, sequences, SMALL.memory, dtype=torch.float64).transpose(0, 1).requires_grad_()
+    action = torch.randn(sequences, steps, 2, dtype=torch.float64, requires_grad=True)
     tau = torch.rand(sequences, tau_steps, 4, dtype=torch.float64)
-    beta = torch.randn(sequences, risk_steps, SMALL.head, dtype=torch.float64, requires_grad=not frozen)
-    return head, [x, tau, beta]
+    beta = None if risk_steps is None else torch.randn(sequences, risk_steps, SMALL.cosines, dtype=torch.float64)
+    return head, (memory, action, tau, beta)
+
+
+def by_kernels(head: QuantileHead, inputs: Inputs) -> Tensor:
+    return quantile_values.quantile_values(*inputs, head.cosines.frequencies, head.stack)
 
 
 @pytest.mark.parametrize("steps", [1, 3, 300])
 @pytest.mark.parametrize("tau_shared", [True, False])
-@pytest.mark.parametrize("risk_shared", [True, False])
+@pytest.mark.parametrize("risk", ["shared", "each", "none"])
 @pytest.mark.parametrize("frozen", [True, False])
-def test_quantile_values_equal_the_layers(steps: int, tau_shared: bool, risk_shared: bool, frozen: bool) -> None:
-    head, (x, tau, beta) = quantile_head(steps, 1 if tau_shared else steps, 1 if risk_shared else steps, frozen=frozen)
-    layers = (head.gate_tau.weight, head.hidden, head.output)
-    fast = quantile_kernels.quantile_values(x, tau, beta, head.cosines.frequencies, *layers)
-    plain = head.layers(x, tau, beta)
+def test_quantile_values_equal_the_layers(steps: int, tau_shared: bool, risk: str, frozen: bool) -> None:
+    risk_steps = {"shared": 1, "each": steps, "none": None}[risk]
+    head, inputs = quantile_head(steps, 1 if tau_shared else steps, risk_steps, frozen=frozen)
+    fast, plain = by_kernels(head, inputs), head.layers(*inputs)
     torch.testing.assert_close(fast, plain)
-    parameters = [head.gate_tau.weight, *head.hidden.parameters(), *head.output.parameters()]
-    inputs = [x] if frozen else [x, beta, *parameters]
-    torch.testing.assert_close(gradients(fast, inputs), gradients(plain, inputs))
+    learned = [*inputs[:2], *(() if frozen else head.parameters())]
+    torch.testing.assert_close(gradients(fast, learned), gradients(plain, learned))
     chosen = torch.rand(*fast.shape[:2], 1) < 0.5  # as where the smaller of two critics counts
-    torch.testing.assert_close(gradients(fast * chosen, inputs), gradients(plain * chosen, inputs))
+    torch.testing.assert_close(gradients(fast * chosen, learned), gradients(plain * chosen, learned))
+    if frozen:
+        never = gradients(0.0 * fast, learned)
+        assert all(not value.any() for value in never)
     with torch.no_grad():
-        torch.testing.assert_close(
-            quantile_kernels.quantile_values(x, tau, beta, head.cosines.frequencies, *layers), plain
-        )
+        torch.testing.assert_close(by_kernels(head, inputs), plain)
 
 
-@pytest.mark.parametrize("risk_steps", [1, 2])
-def test_quantile_values_against_finite_differences(risk_steps: int) -> None:
-    head, (x, tau, beta) = quantile_head(2, 1, risk_steps, frozen=False)
-    layers = (head.hidden, head.output)
-    parameters = [head.gate_tau.weight, *(p for layer in layers for p in layer.parameters())]
-    inputs = (x[:2].detach().requires_grad_(), tau[:2], beta[:2].detach().requires_grad_(), head.cosines.frequencies)
-    assert torch.autograd.gradcheck(quantile_kernels._QuantileValues.apply, (*inputs, *parameters))
+@pytest.mark.parametrize("risk_steps", [1, 2, None])
+def test_quantile_values_against_finite_differences(risk_steps: int | None) -> None:
+    head, inputs = quantile_head(2, 1, risk_steps, sequences=2)
+    names = ("input", "gate_tau", "hidden", "output")
+    parameters = [
+        *(p for name in names[:2] for p in getattr(head, name).parameters()),
+        None if risk_steps is None else head.gate_beta.weight,
+        *(p for name in names[2:] for p in getattr(head, name).parameters()),
+    ]
+    apply = quantile_values._QuantileValues.apply
+    assert torch.autograd.gradcheck(apply, (*inputs, head.cosines.frequencies, *parameters))
 
 
 def test_range_features_export_as_plain_layers() -> None:

@@ -33,16 +33,6 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"c
 
 
 @_compiled
-def _rectify(rows: np.ndarray, bias: np.ndarray) -> None:
-    """Add the bias to every row and rectify, in place."""
-    zero = rows.dtype.type(0)
-    for r in range(rows.shape[0]):
-        row = rows[r]
-        for h in range(row.size):
-            row[h] = max(row[h] + bias[h], zero)
-
-
-@_compiled
 def _heard(bins: np.ndarray, taps: int) -> np.ndarray:
     """Return the positions of the second convolution that see a bin which is not 0 in all the batch, or the first."""
     sounds = np.zeros(bins.shape[1], np.uint8)
@@ -140,28 +130,94 @@ def _unite(
 
 
 @_compiled
+def _silent_activations(w2: np.ndarray, b1: np.ndarray, b2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return both convolutions' activations where they see silent bins alone."""
+    first, second = np.maximum(b1, b1.dtype.type(0)), b2.copy()
+    for o in range(second.size):
+        for i in range(first.size):
+            for s in range(_SEEN):
+                second[o] += w2[o, i, s] * first[i]
+    return first, np.maximum(second, b2.dtype.type(0))
+
+
+@_compiled
+def _by_tap(w1: np.ndarray, w2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights as the passes read them: ``[taps, channel]``, and ``[tap and channel in, channel out]``."""
+    taps, channels = np.empty((w1.shape[2], w1.shape[0]), w1.dtype), w2.shape[1]
+    for c in range(w1.shape[0]):
+        for k in range(w1.shape[2]):
+            taps[k, c] = w1[c, 0, k]
+    kernel = np.empty((_SEEN * channels, w2.shape[0]), w2.dtype)
+    for o in range(w2.shape[0]):
+        for i in range(channels):
+            for s in range(_SEEN):
+                kernel[s * channels + i, o] = w2[o, i, s]
+    return taps, kernel
+
+
+@_compiled
 def _range_layers(
     bins: np.ndarray,
     positions: np.ndarray,
-    taps: np.ndarray,
-    bias_1: np.ndarray,
-    kernel: np.ndarray,
-    bias_2: np.ndarray,
+    convolutions: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    by_position: np.ndarray,
+    b3: np.ndarray,
     heard: np.ndarray,
-    windows: np.ndarray,
+    silent: np.ndarray,
     activations: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Write the second convolution's activations and the linear layer's product with them."""
-    number = positions.size
-    size = windows.shape[0] // number
+    """Write the features into out's first columns, and what the way back reads of heard and silent positions."""
+    w1, b1, w2, b2 = convolutions
+    number, zero, features = positions.size, bins.dtype.type(0), b3.size
+    taps, kernel = _by_tap(w1, w2)
+    _divide(by_position, positions, heard, silent)
+    _, quiet = _silent_activations(w2, b1, b2)
+    offset = b3 + (silent * quiet).sum(1)
+    size = _block(bins.shape[0], number)
+    windows = np.empty((size * number, kernel.shape[0]), bins.dtype)
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
         window, rows = windows[: (stop - start) * number], activations[start * number : stop * number]
-        _first_layer(bins[start:stop], positions, taps, bias_1, window)
+        _first_layer(bins[start:stop], positions, taps, b1, window)
         times(window, kernel, rows, False)
-        _rectify(rows, bias_2)
-        times_transposed(rows.reshape(stop - start, -1), heard, out[start:stop], False)
+        for r in range(rows.shape[0]):
+            row = rows[r]
+            for c in range(row.size):
+                row[c] = max(row[c] + b2[c], zero)
+        times_transposed(rows.reshape(stop - start, -1), _flat(heard), out[start:stop, :features], False)
+    _rectify(out, 0, offset)
+
+
+@_compiled
+def _linear(vector: np.ndarray, weight: np.ndarray, bias: np.ndarray, first: int, out: np.ndarray) -> None:
+    """Write a rectified linear layer into out's columns from the first on."""
+    times_transposed(vector, weight, out[:, first : first + bias.size], False)
+    _rectify(out, first, bias)
+
+
+@_compiled
+def _rectify(out: np.ndarray, first: int, bias: np.ndarray) -> None:
+    """Add the bias to the columns from the first on and rectify, in place."""
+    zero = out.dtype.type(0)
+    for r in range(out.shape[0]):
+        row = out[r, first : first + bias.size]
+        for h in range(row.size):
+            row[h] = max(row[h] + bias[h], zero)
+
+
+@_compiled
+def _where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> np.ndarray:
+    """Return the gradient where out is active, and write its sums."""
+    zero = out.dtype.type(0)
+    result = np.empty_like(out)
+    d_bias[:] = zero
+    for r in range(out.shape[0]):
+        row, slopes, values = result[r], gradient[r], out[r]
+        for h in range(row.size):
+            row[h] = slopes[h] if values[h] > zero else zero
+            d_bias[h] += row[h]
+    return result
 
 
 @_compiled
@@ -169,37 +225,69 @@ def _range_gradient(
     gradient: np.ndarray,
     bins: np.ndarray,
     positions: np.ndarray,
-    taps: np.ndarray,
-    bias_1: np.ndarray,
-    kernel: np.ndarray,
+    convolutions: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     heard: np.ndarray,
-    windows: np.ndarray,
+    silent: np.ndarray,
     activations: np.ndarray,
-    d_taps: np.ndarray,
-    d_bias_1: np.ndarray,
-    d_kernel: np.ndarray,
-    d_bias_2: np.ndarray,
-    d_heard: np.ndarray,
+    d_convolutions: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    d_by_position: np.ndarray,
+    d_b3: np.ndarray,
 ) -> None:
-    """Add the gradients of all that the range layers read but the bins."""
-    number, zero = positions.size, bins.dtype.type(0)
-    size = windows.shape[0] // number
+    """Write the gradients of all layers from that of the linear layer's output, ``gradient``; that of b3 is given."""
+    (w1, b1, w2, b2), (d_w1, d_b1, d_w2, d_b2) = convolutions, d_convolutions
+    number, zero, channels = positions.size, bins.dtype.type(0), b1.size
+    taps, kernel = _by_tap(w1, w2)
+    d_taps, d_kernel, d_heard = np.zeros_like(taps), np.zeros_like(kernel), np.zeros_like(heard)
+    d_b1[:], d_b2[:] = zero, zero
+    size = _block(bins.shape[0], number)
+    windows = np.empty((size * number, kernel.shape[0]), bins.dtype)
     d_windows, d_activations = np.empty_like(windows), np.empty_like(activations[: size * number])
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
         window, d_window = windows[: (stop - start) * number], d_windows[: (stop - start) * number]
         rows, d_rows = activations[start * number : stop * number], d_activations[: (stop - start) * number]
-        transposed_times(gradient[start:stop], rows.reshape(stop - start, -1), d_heard, True)
-        times(gradient[start:stop], heard, d_rows.reshape(stop - start, -1), False)
+        slopes = gradient[start:stop, : d_b3.size]
+        transposed_times(slopes, rows.reshape(stop - start, -1), _flat(d_heard), True)
+        times(slopes, _flat(heard), d_rows.reshape(stop - start, -1), False)
         for r in range(rows.shape[0]):
             row, d_row = rows[r], d_rows[r]
             for c in range(row.size):
                 d_row[c] = d_row[c] if row[c] > zero else zero
-                d_bias_2[c] += d_row[c]
-        _first_layer(bins[start:stop], positions, taps, bias_1, window)
+                d_b2[c] += d_row[c]
+        _first_layer(bins[start:stop], positions, taps, b1, window)
         transposed_times(window, d_rows, d_kernel, True)
         times_transposed(d_rows, kernel, d_window, False)
-        _first_layer_gradient(bins[start:stop], positions, window, d_window, d_taps, d_bias_1)
+        _first_layer_gradient(bins[start:stop], positions, window, d_window, d_taps, d_b1)
+    # What the silent positions add to the linear layer's bias, backwards.
+    first, second = _silent_activations(w2, b1, b2)
+    d_second = np.zeros_like(second)
+    for f in range(d_b3.size):
+        for o in range(channels):
+            d_second[o] += d_b3[f] * silent[f, o]
+    for o in range(channels):
+        d_second[o] = d_second[o] if second[o] > zero else zero
+        d_b2[o] += d_second[o]
+    for o in range(channels):
+        for i in range(channels):
+            for s in range(_SEEN):
+                d_w2[o, i, s] = d_kernel[s * channels + i, o] + first[i] * d_second[o]
+                d_b1[i] += w2[o, i, s] * d_second[o] if first[i] > zero else zero
+    for c in range(channels):
+        for k in range(taps.shape[0]):
+            d_w1[c, 0, k] = d_taps[k, c]
+    _unite(d_by_position, positions, d_heard, d_b3, second)
+
+
+@_compiled
+def _flat(heard: np.ndarray) -> np.ndarray:
+    """Return ``[features, position, channel]`` as a matrix."""
+    return heard.reshape(heard.shape[0], heard.shape[1] * heard.shape[2])
+
+
+@_compiled
+def _block(observations: int, positions: int) -> int:
+    """Return how many observations go through the layers together."""
+    return min(observations, max(1, _ROWS_PER_BLOCK // positions))
 
 
 # ------------------------------------------------------------------------------------------------ features
@@ -213,71 +301,46 @@ class _ObservationFeatures(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, bins: Tensor, vectors: Sequence[Tensor], *parameters: Tensor) -> Tensor:
-        w1, b1, w2, b2, w3, b3, *others = parameters
-        positions = _heard(bins.numpy(), w1.shape[2])
-        kernel = w2.permute(2, 1, 0).reshape(-1, w2.shape[0])  # [position seen and channel, channel]
-        taps = w1[:, 0].t().contiguous().numpy()
-        heard, silent = _divided(w3, positions, w2.shape[0])
-        silent_1 = b1.relu()
-        silent_2 = torch.addmv(b2, kernel.t(), torch.cat([silent_1] * _SEEN)).relu_()
-        widths = [len(b3), *(len(bias) for bias in others[1::2])]
-        result = bins.new_empty(len(bins), sum(widths))
-        range_features, *vector_features = result.split(widths, dim=1)
-        activations = bins.new_empty(len(bins) * len(positions), w2.shape[0])
-        windows = _window_buffer(bins, positions, kernel)
-        layers = (value.numpy() for value in (b1, kernel, b2, heard, windows, activations, range_features))
-        _range_layers(bins.numpy(), positions, taps, *layers)
-        for vector, weight, out in zip(vectors, others[::2], vector_features, strict=True):
-            torch.mm(vector, weight.t(), out=out)
-        _rectify(result.numpy(), torch.cat((torch.addmv(b3, silent, silent_2), *others[1::2])).numpy())
-        ctx.save_for_backward(bins, w1, b1, kernel, heard, silent, silent_1, silent_2, activations, result, *vectors)
-        ctx.positions, ctx.taps, ctx.widths, ctx.shape_3 = positions, taps, widths, w3.shape
+        *convolutions, w3, b3 = parameters[:6]
+        weights, biases = parameters[6::2], parameters[7::2]
+        channels, places = len(convolutions[0]), np.cumsum([len(b3), *map(len, biases)])
+        positions = _heard(bins.numpy(), convolutions[0].shape[2])
+        heard, silent = bins.new_empty(len(b3), len(positions), channels), bins.new_empty(len(b3), channels)
+        activations = bins.new_empty(len(bins) * len(positions), channels)
+        result = bins.new_empty(len(bins), places[-1])
+        of_range = tuple(value.numpy() for value in convolutions), w3.view(len(b3), -1, channels).numpy(), b3.numpy()
+        kept = heard.numpy(), silent.numpy(), activations.numpy()
+        _range_layers(bins.numpy(), positions, *of_range, *kept, result.numpy())
+        for vector, weight, bias, first in zip(vectors, weights, biases, places[:-1], strict=True):
+            _linear(vector.numpy(), weight.numpy(), bias.numpy(), first, result.numpy())
+        ctx.save_for_backward(bins, *convolutions, w3, heard, silent, activations, result, *vectors)
+        ctx.positions, ctx.places = positions, places
         return result
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        bins, w1, b1, kernel, heard, silent, silent_1, silent_2, activations, result, *vectors = ctx.saved_tensors
-        positions, taps, channels = ctx.positions, ctx.taps, len(b1)
-        gradient = torch.ops.aten.threshold_backward(gradient, result, 0)
-        d_features, *d_vectors = gradient.split(ctx.widths, dim=1)
-        d_b3, *d_biases = gradient.sum(0).split(ctx.widths)
-        d_w1, d_b1, d_b2 = bins.new_zeros(w1.shape[2], channels), torch.zeros_like(b1), torch.zeros_like(b1)
-        d_kernel, d_heard = torch.zeros_like(kernel), torch.zeros_like(heard)
-        windows = _window_buffer(bins, positions, kernel)
-        layers = (value.numpy() for value in (b1, kernel, heard, windows, activations))
-        gradients = (value.numpy() for value in (d_w1, d_b1, d_kernel, d_b2, d_heard))
-        _range_gradient(d_features.numpy(), bins.numpy(), positions, taps, *layers, *gradients)
-        # What the silent positions add to the linear layer's bias, backwards.
-        d_silent_2 = (silent.t() @ d_b3).mul_(silent_2 > 0)
-        d_silent_1 = (kernel @ d_silent_2).view(_SEEN, channels).sum(0).mul_(silent_1 > 0)
-        d_kernel.addr_(torch.cat([silent_1] * _SEEN), d_silent_2)
-        d_w3 = bins.new_empty(ctx.shape_3)
-        d_by_position, d_heard = d_w3.view(len(d_b3), -1, channels), d_heard.view(len(d_b3), -1, channels)
-        _unite(d_by_position.numpy(), positions, d_heard.numpy(), d_b3.numpy(), silent_2.numpy())
-        d_w2 = d_kernel.view(_SEEN, channels, channels).permute(2, 1, 0)
-        d_others = [
-            value
-            for d_vector, vector, d_bias in zip(d_vectors, vectors, d_biases, strict=True)
-            for value in (torch.mm(d_vector.t(), vector), d_bias)
-        ]
-        d_w1 = d_w1.t().reshape(w1.shape)
-        return None, None, d_w1, d_b1 + d_silent_1, d_w2, d_b2 + d_silent_2, d_w3, d_b3, *d_others
-
-
-def _divided(w3: Tensor, positions: np.ndarray, channels: int) -> tuple[Tensor, Tensor]:
-    """Return the linear layer's weight at the heard positions, and its sum over the silent ones."""
-    by_position = w3.detach().view(len(w3), -1, channels)
-    heard = w3.new_empty(len(w3), len(positions), channels)
-    silent = w3.new_empty(len(w3), channels)
-    _divide(by_position.numpy(), positions, heard.numpy(), silent.numpy())
-    return heard.flatten(1), silent
-
-
-def _window_buffer(bins: Tensor, positions: np.ndarray, kernel: Tensor) -> Tensor:
-    """Return room for the windows of a block of whole observations."""
-    observations = min(len(bins), max(1, _ROWS_PER_BLOCK // len(positions)))
-    return bins.new_empty(observations * len(positions), len(kernel))
+        bins, w1, b1, w2, b2, w3, heard, silent, activations, result, *vectors = ctx.saved_tensors
+        d_biases = result.new_empty(result.shape[1])
+        slopes = _where_active(gradient.contiguous().numpy(), result.numpy(), d_biases.numpy())
+        d_w3, (d_b3, *d_others) = torch.empty_like(w3), d_biases.tensor_split(ctx.places[:-1].tolist())
+        d_convolutions = [torch.empty_like(value) for value in (w1, b1, w2, b2)]
+        _range_gradient(
+            slopes,
+            bins.numpy(),
+            ctx.positions,
+            tuple(value.numpy() for value in (w1, b1, w2, b2)),
+            *(value.numpy() for value in (heard, silent, activations)),
+            tuple(value.numpy() for value in d_convolutions),
+            d_w3.view(len(d_b3), -1, len(b1)).numpy(),
+            d_b3.numpy(),
+        )
+        d_layers: list[Tensor] = []
+        for vector, d_bias, first in zip(vectors, d_others, ctx.places[:-1], strict=True):
+            d_weight = vector.new_empty(len(d_bias), vector.shape[1])
+            transposed_times(slopes[:, first : first + len(d_bias)], vector.numpy(), d_weight.numpy(), False)
+            d_layers += [d_weight, d_bias]
+        return None, None, *d_convolutions, d_w3, d_b3, *d_layers
 
 
 def observation_features(

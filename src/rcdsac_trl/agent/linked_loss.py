@@ -151,6 +151,8 @@ class LinkedLoss(LossModule):
         params = self._modules["target_critic_network_params"]  # the attribute warns before there is an updater
         params.to_module(nn.ModuleList(self._target_critics))
         self.critic_network_params.data.to_module(nn.ModuleList(self._frozen_critics))
+        for critic in self._frozen_critics:
+            critic.requires_grad_(False)  # lent tensors become parameters, which would take gradients again
         of_actor, of_critics = self.actor_network.parameters(), self.critic_network.parameters()
         self._trained = {"loss_actor": list(of_actor), "loss_qvalue": list(of_critics), "loss_alpha": [self.log_alpha]}
 

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rcdsac_trl.agent.kernels import observation_features
-from rcdsac_trl.agent.quantile_kernels import quantile_values
+from rcdsac_trl.agent.quantile_values import HeadLayers, quantile_values
 from rcdsac_trl.agent.recurrent_kernels import gated_recurrence
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
@@ -253,21 +253,28 @@ class QuantileHead(nn.Module):
             tau: fractions in [0, 1], ``[B, L, N]`` or, the same along a sequence, ``[B, 1, N]``.
             risk: ``beta``, ``[B, L, 1]`` or ``[B, 1, 1]``; not read without a measure.
         """
-        x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
-        if self.measure is None:
-            beta = self.gate_tau.bias.expand(len(x), 1, -1)
-        elif risk is None:
-            raise ValueError("this critic is conditioned on risk: pass it")
-        else:
-            beta = self.gate_beta(self.cosines(self.measure.embed(risk).squeeze(-1))) + self.gate_tau.bias
-        if not _runs_kernels(x):
-            return self.layers(x, tau, beta)
-        return quantile_values(x, tau, beta, self.cosines.frequencies, self.gate_tau.weight, self.hidden, self.output)
+        beta = None
+        if self.measure is not None:
+            if risk is None:
+                raise ValueError("this critic is conditioned on risk: pass it")
+            beta = self.cosines(self.measure.embed(risk).squeeze(-1))
+        if not _runs_kernels(memory):
+            return self.layers(memory, action, tau, beta)
+        return quantile_values(memory, action, tau, beta, self.cosines.frequencies, self.stack)
 
-    def layers(self, x: Tensor, tau: Tensor, beta: Tensor) -> Tensor:
-        """Compute features ``[B, L, H]`` and beta's part of the gate, with the bias, to quantiles layer by layer."""
-        gate = F.relu(F.linear(self.cosines(tau), self.gate_tau.weight) + beta.unsqueeze(2))
-        return self.output(F.relu(self.hidden(x.unsqueeze(2) * gate))).squeeze(-1)
+    @property
+    def stack(self) -> HeadLayers:
+        """The linear layers."""
+        gate_beta = None if self.measure is None else self.gate_beta
+        return HeadLayers(self.input, self.gate_tau, gate_beta, self.hidden, self.output)
+
+    def layers(self, memory: Tensor, action: Tensor, tau: Tensor, beta: Tensor | None) -> Tensor:
+        """Compute the same from beta's cosines, layer by layer."""
+        x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
+        gate = self.gate_tau(self.cosines(tau))
+        if beta is not None:
+            gate = gate + self.gate_beta(beta).unsqueeze(2)
+        return self.output(F.relu(self.hidden(x.unsqueeze(2) * F.relu(gate)))).squeeze(-1)
 
 
 class ScalarHead(nn.Module):

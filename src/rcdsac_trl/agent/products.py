@@ -58,7 +58,19 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 @intrinsic
 def _gemm(
-    _: Any, flip_a: Any, flip_b: Any, m: Any, n: Any, k: Any, a: Any, lda: Any, b: Any, ldb: Any, add: Any, c: Any, ldc: Any
+    _: Any,
+    flip_a: Any,
+    flip_b: Any,
+    m: Any,
+    n: Any,
+    k: Any,
+    a: Any,
+    lda: Any,
+    b: Any,
+    ldb: Any,
+    add: Any,
+    c: Any,
+    ldc: Any,
 ) -> tuple[Any, Callable[..., Any]]:
     """Call BLAS's ``c = op(a) op(b)``, or ``+=`` where ``add``, on matrices column by column; flips are bools."""
 

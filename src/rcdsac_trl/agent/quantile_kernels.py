@@ -1,30 +1,17 @@
-r"""The quantile critics' hot pieces on a CPU, each with its backward pass written out.
+"""The compiled passes of :mod:`rcdsac_trl.agent.quantile_values`, on arrays.
 
-They compute exactly what ordinary layers do (tests hold them against those, and against finite differences). A batch
-of 6,400 transitions has 100,000 quantiles: as ordinary layers, every gate, product and activation of theirs is 50
-MB that goes to main memory and back between two operations. Here one compiled pass takes rows through all layers, matrix
-products included, in blocks that stay in the cache.
-
-Public names::
-
-    quantile_values(x [B,L,H], tau [B,L|1,N], beta [B,L|1,H], frequencies [C], gate [H,C], hidden, output) -> [B,L,N]
+Rows go through all layers, matrix products included, in blocks that stay in the cache. Shapes: B sequences of L steps
+have N fractions each; H features, C cosines. What is constant along a sequence has one step.
 """
-
-from typing import Any
 
 import numba
 import numpy as np
-import torch
-from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from rcdsac_trl.agent.products import times, times_transposed, transposed_times
 
-# Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
-_ROWS_PER_BLOCK = 1024
+#: Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
+ROWS_PER_BLOCK = 1024
 
-
-# ------------------------------------------------------------------------------------------------ compiled passes
 # A sum over features may be added up in any order, which lets several be added at once. A loop has few arrays: of many
 # the compiler gives up showing that they are apart.
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
@@ -132,7 +119,56 @@ def _product_gradient(
 
 
 @_compiled
-def _layers(
+def input_layer(joined: np.ndarray, weight: np.ndarray, bias: np.ndarray, x: np.ndarray) -> None:
+    """Write the features ``[B, L, H]`` of memory and action side by side."""
+    rows, zero = _rows(x), x.dtype.type(0)
+    times_transposed(_rows(joined), weight, rows, False)
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        for h in range(row.size):
+            row[h] = max(row[h] + bias[h], zero)
+
+
+@_compiled
+def input_gradient(x: np.ndarray, weight: np.ndarray, d_x: np.ndarray, d_joined: np.ndarray) -> None:
+    """Turn the gradient of the features into that before their rectifier, and write that of memory and action."""
+    rows, d_rows, zero = _rows(x), _rows(d_x), x.dtype.type(0)
+    for r in range(rows.shape[0]):
+        row, d_row = rows[r], d_rows[r]
+        for h in range(row.size):
+            d_row[h] = d_row[h] if row[h] > zero else zero
+    times(d_rows, weight, _rows(d_joined), False)
+
+
+@_compiled
+def affine_gradient(d_out: np.ndarray, given: np.ndarray, d_weight: np.ndarray, d_bias: np.ndarray) -> None:
+    """Write the gradients of a linear layer's weight and bias."""
+    d_rows = _rows(d_out)
+    transposed_times(d_rows, _rows(given), d_weight, False)
+    add_up(d_rows, d_bias)
+
+
+@_compiled
+def add_up(rows: np.ndarray, total: np.ndarray) -> None:
+    """Write the sum of the rows."""
+    total[:] = 0
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        for h in range(row.size):
+            total[h] += row[h]
+
+
+@_compiled
+def offsets(cosines: np.ndarray, weight: np.ndarray, bias: np.ndarray, beta: np.ndarray) -> None:
+    """Write beta's part of the gates, bias included, ``[B, L, H]``."""
+    rows = _rows(beta)
+    for r in range(rows.shape[0]):
+        rows[r] = bias
+    times_transposed(_rows(cosines), weight, rows, True)
+
+
+@_compiled
+def layers(
     x: np.ndarray,
     cosines: np.ndarray,
     beta: np.ndarray,
@@ -160,7 +196,7 @@ def _layers(
 
 
 @_compiled
-def _layers_gradient(
+def layers_gradient(
     slopes: np.ndarray,
     x: np.ndarray,
     cosines: np.ndarray,
@@ -199,7 +235,7 @@ def _layers_gradient(
 
 
 @_compiled
-def _gradient_of_features(
+def gradient_of_features(
     slopes: np.ndarray,
     beta: np.ndarray,
     tau_gate: np.ndarray,
@@ -222,108 +258,10 @@ def _gradient_of_features(
 @_compiled
 def _block(rows: int, sequences: int) -> int:
     """Return how many sequences of so many rows each go through the layers together."""
-    return min(sequences, max(1, _ROWS_PER_BLOCK // rows))
+    return min(sequences, max(1, ROWS_PER_BLOCK // rows))
 
 
 @_compiled
 def _rows(array: np.ndarray) -> np.ndarray:
     """Return all but the last dimension as one."""
     return array.reshape(array.size // array.shape[-1], array.shape[-1])  # -1 cannot be inferred of no rows
-
-
-# ------------------------------------------------------------------------------------------------ quantile values
-class _QuantileValues(torch.autograd.Function):
-    """``output(relu(hidden(x * relu(gate @ cos(frequencies * tau) + beta))))``.
-
-    Gates are computed for some sequences at a time, and multiplied with their features for fewer: along a sequence
-    that shares its fractions there are far more products than gates.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any,
-        x: Tensor,
-        tau: Tensor,
-        beta: Tensor,
-        frequencies: Tensor,
-        gate_weight: Tensor,
-        weight: Tensor,
-        bias: Tensor,
-        out_weight: Tensor,
-        out_bias: Tensor,
-    ) -> Tensor:
-        (sequences, steps, size), (shared, number) = x.shape, tau.shape[1:]
-        keep, blocks = any(ctx.needs_input_grad), _gate_blocks(tau)
-        gated = sequences if keep else blocks[0].stop
-        cosines = x.new_empty(gated, shared, number, len(frequencies))
-        tau_gate = x.new_empty(gated, shared, number, size)
-        # What nothing goes back through needs no place of its own.
-        inner = sequences if keep else min(blocks[0].stop, max(1, _ROWS_PER_BLOCK // (steps * number)))
-        hidden = x.new_empty(inner, steps, number, len(weight))
-        result = x.new_empty(sequences, steps, number)
-        layers = [value.numpy() for value in (gate_weight, weight, bias, out_weight.view(-1), out_bias)]
-        features, offsets, values = x.numpy(), beta.numpy(), result.numpy()
-        for block in blocks:
-            place = block if keep else slice(0, block.stop - block.start)
-            torch.cos(tau[block].unsqueeze(-1) * frequencies, out=cosines[place])
-            given = features[block], cosines[place].numpy(), offsets[block]
-            rooms = tau_gate[place].numpy(), hidden[place].numpy() if keep else hidden.numpy()
-            _layers(*given, *layers, *rooms, values[block])
-        if keep:
-            ctx.save_for_backward(x, beta, gate_weight, weight, out_weight, cosines, tau_gate, hidden)
-        return result
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        x, beta, gate_weight, weight, out_weight, cosines, tau_gate, hidden = ctx.saved_tensors
-        gradient = gradient.contiguous()
-        # The output layer's weight is the same for every row: it goes into the matrices instead of the rows.
-        column = out_weight.view(-1, 1)
-        through = weight * column
-        d_x = torch.zeros_like(x)
-        if not ctx.needs_input_grad[5]:
-            known = gradient, beta, tau_gate, hidden, through
-            _gradient_of_features(*(value.numpy() for value in (*known, d_x)))
-            return d_x, *[None] * 8
-        d_beta, d_gate_weight = torch.zeros_like(beta), torch.zeros_like(gate_weight)
-        d_weight, d_bias, d_out_weight = torch.zeros_like(weight), x.new_zeros(len(weight)), x.new_zeros(len(weight))
-        along = [value.numpy() for value in (gradient, x, cosines, beta, tau_gate, hidden)]
-        sums = [value.numpy() for value in (d_gate_weight, d_weight, d_bias, d_out_weight)]
-        for block in _gate_blocks(tau_gate):
-            written = d_x[block].numpy(), d_beta[block].numpy()
-            _layers_gradient(*(value[block] for value in along), through.numpy(), *written, *sums)
-        d_weight, d_bias = d_weight.mul_(column), d_bias.mul_(out_weight.view(-1))
-        d_output = d_out_weight.view_as(out_weight), gradient.sum().view(1)
-        return d_x, None, d_beta, None, d_gate_weight, d_weight, d_bias, *d_output
-
-
-def _gate_blocks(gates: Tensor) -> list[slice]:
-    """Cut the sequences ``[B, L|1, N, ..]`` into blocks whose gates are computed together."""
-    size = max(1, _ROWS_PER_BLOCK // gates.shape[1:3].numel())
-    return [slice(start, min(start + size, len(gates))) for start in range(0, len(gates), size)]
-
-
-def quantile_values(
-    x: Tensor, tau: Tensor, beta: Tensor, frequencies: Tensor, gate: Tensor, hidden: nn.Linear, output: nn.Linear
-) -> Tensor:
-    """Return ``output(relu(hidden(x * relu(gate @ cos(frequencies * tau) + beta))))``, ``[B, L, N]``.
-
-    Either all layers and ``beta`` take a gradient, or only ``x`` does.
-
-    Args:
-        x: features of a transition ``[B, L, H]``.
-        tau: fractions ``[B, L, N]``, or ``[B, 1, N]`` where constant along a sequence.
-        beta: its part of the gate before rectification, bias included, ``[B, L, H]`` or ``[B, 1, H]``.
-        frequencies: of the fractions' cosines ``[C]``.
-        gate: weight of the fractions' part of the gate ``[H, C]``.
-        hidden: linear layer H to H'.
-        output: linear layer H' to 1.
-    """
-    shape = x.shape[:2]
-    if tau.shape[1] == beta.shape[1] == shape[1]:
-        # Nothing is shared along a sequence: blocks need not hold whole ones.
-        x, tau, beta = (value.reshape(-1, 1, value.shape[-1]) for value in (x, tau, beta))
-    parameters = [p for layer in (hidden, output) for p in (layer.weight, layer.bias)]
-    values = _QuantileValues.apply(x.contiguous(), tau, beta.contiguous(), frequencies, gate, *parameters)
-    return values.view(*shape, -1)

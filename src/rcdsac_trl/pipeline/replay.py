@@ -258,15 +258,20 @@ class SequenceReplay:
         slots = flat.reshape(self.batch_size, self.sequence_slots)
         weight = slots["collision_weight"] if "collision_weight" in self.context_keys else 1.0
         reward = slots["reward_rest"] + weight * slots["reward_collision"]
-        kept = {key: slots[key] for key in ("waypoint", "velocity", "action")}
+        kept = {key: _step_by_step(slots[key]) for key in ("waypoint", "velocity")} | {"action": slots["action"]}
         # One value expanded: the loss then knows that a sequence shares it.
         kept |= {key: slots[key][:, :1].expand(-1, self.sequence_slots, -1) for key in self.context_keys}
         return TensorDict(
             {
                 **kept,
-                "range": self.codec.decode(slots["range"]),
+                "range": _step_by_step(self.codec.decode(slots["range"])),
                 "next": {"reward": reward, "terminated": torch.zeros_like(reward, dtype=torch.bool)},
             },
             batch_size=slots.batch_size,
             device=self.device,
         )
+
+
+def _step_by_step(observation: Tensor) -> Tensor:
+    """Lay a batch ``[B, T, ..]`` out as recurrent layers read it, which every network would do for itself."""
+    return observation.transpose(0, 1).contiguous().transpose(0, 1)
