@@ -1,8 +1,8 @@
 """Matrix products within compiled passes, by the BLAS that torch multiplies with.
 
-A call of ``torch.mm`` and the slices around it take longer than the product of a few hundred rows, and come back to
-Python between any two. Numba's own ``@`` calls SciPy's BLAS, which is slower than the MKL that torch has on x86, and runs
-on threads that torch knows nothing of.
+A call of ``torch.mm`` and the slices around it take as long as the product of a hundred rows, and come back to Python
+between any two. Numba's own ``@`` calls SciPy's BLAS, which is a quarter slower than the MKL that torch has on x86, and
+whose threads torch knows nothing of.
 
 Public names::
 
@@ -54,9 +54,10 @@ def _name_routines() -> str:
 
 LIBRARY = _name_routines()
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_intrinsic: Any = intrinsic  # the caller does not pass the first argument, which its type does not say
 
 
-@intrinsic
+@_intrinsic
 def _gemm(
     _: Any,
     flip_a: Any,

@@ -73,8 +73,9 @@ class _QuantileValues(torch.autograd.Function):
         for block in blocks:
             place = block if keep else slice(0, block.stop - block.start)
             torch.cos(tau[block].unsqueeze(-1) * frequencies, out=cosines[place])
-            rooms = tau_gate[place].numpy(), hidden[place].numpy() if keep else hidden.numpy()
-            kernels.layers(features[block], cosines[place].numpy(), added[block], *inside, *rooms, values[block])
+            given = [features[block], cosines[place].numpy(), added[block]]
+            rooms = [tau_gate[place].numpy(), hidden[place].numpy() if keep else hidden.numpy()]
+            kernels.layers(*(given + inside + rooms + [values[block]]))
         if keep:
             ctx.save_for_backward(joined, x, beta, offsets, cosines, tau_gate, hidden, w_in, w_tau, weight, w_out)
             ctx.memory_size = memory.shape[-1]
@@ -100,8 +101,8 @@ class _QuantileValues(torch.autograd.Function):
             along = [value.numpy() for value in (gradient, x, cosines, offsets, tau_gate, hidden)]
             sums = [value.numpy() for value in (d_tau, d_weight, d_bias, d_out)]
             for block in _gate_blocks(tau_gate):
-                written = d_x[block].numpy(), d_offsets[block].numpy()
-                kernels.layers_gradient(*(value[block] for value in along), through.numpy(), *written, *sums)
+                written = [value.numpy() for value in (through, d_x[block], d_offsets[block])]
+                kernels.layers_gradient(*([value[block] for value in along] + written + sums))
             kernels.input_gradient(*(value.numpy() for value in (x, w_in, d_x, d_joined)))
             d_in, (d_b_in, d_b_tau) = torch.empty_like(w_in), w_in.new_empty(2, len(w_in))
             kernels.affine_gradient(*(value.numpy() for value in (d_x, joined, d_in, d_b_in)))

@@ -1,9 +1,9 @@
 r"""A gated recurrent layer that learns, on a CPU, its backward pass written out.
 
 It computes exactly what ``nn.GRU`` does (tests hold it against that, and against finite differences). Torch's own layer
-records some twenty operations a step for its backward pass, among them a matrix product for every weight. Here all steps,
-forth or back, are one compiled pass, with one matrix product a step; whatever does not wait for another step is one
-product over all of them.
+records some twenty operations a step for its backward pass, among them a matrix product for every weight. Here all
+steps, forth or back, are one compiled pass, with one matrix product a step; whatever does not wait for another step is
+one product over all of them.
 
 Public names::
 

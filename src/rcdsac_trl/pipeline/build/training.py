@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl.objectives import LossModule, SoftUpdate
 
+from rcdsac_trl.agent import products
 from rcdsac_trl.agent.targets import FusedSoftUpdate
 from rcdsac_trl.cores import usable_cores
 from rcdsac_trl.interface import sensor_mask
@@ -129,6 +130,7 @@ def trainer(cfg: DictConfig, folder: Path, overrides: Sequence[str] = ()) -> Tra
         "device": runtime.resolve_device(settings.device),
         "threads": runtime.resolve_threads(settings.threads),
         "allocator": runtime.allocator(),
+        "matrix_products": products.LIBRARY,
     }
     logs.check_folder(folder)
     learner = _learner_here(settings)  # before anything is written: it may not fit into the memory
@@ -221,7 +223,8 @@ def _assemble(
             f"continue after {progress.iterations} of {total} iterations, from {saved.path}",
         ]
     log = logs.RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
-    for sentence in [*told, f"device {device}, {threads} threads, allocator: {runtime.allocator()}"]:
+    active = f"allocator: {runtime.allocator()}, matrix products by {products.LIBRARY} BLAS"
+    for sentence in [*told, f"device {device}, {threads} threads, {active}"]:
         log.message(sentence)
     return Trainer(
         schedule=settings.schedule,

@@ -1,39 +1,25 @@
-r"""An observation's layers up to the recurrent one on a CPU, with their backward pass written out.
+"""The compiled passes of :mod:`rcdsac_trl.agent.observation_features`, on arrays.
 
-They compute exactly what ordinary layers do (tests hold them against those, and against finite differences) and exist
-because on a CPU an update spends its time moving memory and calling operations, not multiplying. Here the range
-observation's layers are one compiled pass, matrix products included, in which a batch goes through them in blocks that
-stay in the cache; all layers write into one array of features; and bins that are silent in the whole batch, such as
-those a narrow sensor lacks, are left out.
-
-Public names::
-
-    observation_features(bins [n,180], vectors [n,k].., (conv_1, conv_2, linear), layers) -> [n, features]
+A batch goes through the range observation's layers, matrix products included, in blocks that stay in the cache. Bins
+that are silent in the whole batch, such as those a narrow sensor lacks, are left out. ``convolutions`` are weight and
+bias of the first and of the second.
 """
-
-from collections.abc import Sequence
-from typing import Any
 
 import numba
 import numpy as np
-import torch
-from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from rcdsac_trl.agent.products import times, times_transposed, transposed_times
 
-# Windows of the second convolution that go through the layers together: their inputs and activations take some 2 MB.
-_ROWS_PER_BLOCK = 96 * 43
+#: Windows of the second convolution that go through the layers together: their inputs and activations take some 2 MB.
+ROWS_PER_BLOCK = 96 * 43
 # Positions of the first convolution that one of the second sees, its kernel's size; both have stride 2.
 _SEEN = 3
 
-
-# ------------------------------------------------------------------------------------------------ compiled passes
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @_compiled
-def _heard(bins: np.ndarray, taps: int) -> np.ndarray:
+def heard(bins: np.ndarray, taps: int) -> np.ndarray:
     """Return the positions of the second convolution that see a bin which is not 0 in all the batch, or the first."""
     sounds = np.zeros(bins.shape[1], np.uint8)
     for o in range(bins.shape[0]):
@@ -156,10 +142,10 @@ def _by_tap(w1: np.ndarray, w2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @_compiled
-def _range_layers(
+def range_layers(
     bins: np.ndarray,
     positions: np.ndarray,
-    convolutions: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    convolutions: tuple[np.ndarray, ...],
     by_position: np.ndarray,
     b3: np.ndarray,
     heard: np.ndarray,
@@ -190,7 +176,7 @@ def _range_layers(
 
 
 @_compiled
-def _linear(vector: np.ndarray, weight: np.ndarray, bias: np.ndarray, first: int, out: np.ndarray) -> None:
+def linear(vector: np.ndarray, weight: np.ndarray, bias: np.ndarray, first: int, out: np.ndarray) -> None:
     """Write a rectified linear layer into out's columns from the first on."""
     times_transposed(vector, weight, out[:, first : first + bias.size], False)
     _rectify(out, first, bias)
@@ -207,7 +193,7 @@ def _rectify(out: np.ndarray, first: int, bias: np.ndarray) -> None:
 
 
 @_compiled
-def _where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> np.ndarray:
+def where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> np.ndarray:
     """Return the gradient where out is active, and write its sums."""
     zero = out.dtype.type(0)
     result = np.empty_like(out)
@@ -221,15 +207,15 @@ def _where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> 
 
 
 @_compiled
-def _range_gradient(
+def range_gradient(
     gradient: np.ndarray,
     bins: np.ndarray,
     positions: np.ndarray,
-    convolutions: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    convolutions: tuple[np.ndarray, ...],
     heard: np.ndarray,
     silent: np.ndarray,
     activations: np.ndarray,
-    d_convolutions: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    d_convolutions: tuple[np.ndarray, ...],
     d_by_position: np.ndarray,
     d_b3: np.ndarray,
 ) -> None:
@@ -287,79 +273,4 @@ def _flat(heard: np.ndarray) -> np.ndarray:
 @_compiled
 def _block(observations: int, positions: int) -> int:
     """Return how many observations go through the layers together."""
-    return min(observations, max(1, _ROWS_PER_BLOCK // positions))
-
-
-# ------------------------------------------------------------------------------------------------ features
-class _ObservationFeatures(torch.autograd.Function):
-    """Convolution 5/2, convolution 3/2, linear layer over the bins; a linear layer for every vector; all rectified.
-
-    A row is what a position of the second convolution sees, so that this is one matrix product. Positions that
-    see silent bins alone have no rows: their activation is the same for every observation, and joins the linear
-    layer's bias. The first convolution costs so little that its activations are computed again on the way back.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, bins: Tensor, vectors: Sequence[Tensor], *parameters: Tensor) -> Tensor:
-        *convolutions, w3, b3 = parameters[:6]
-        weights, biases = parameters[6::2], parameters[7::2]
-        channels, places = len(convolutions[0]), np.cumsum([len(b3), *map(len, biases)])
-        positions = _heard(bins.numpy(), convolutions[0].shape[2])
-        heard, silent = bins.new_empty(len(b3), len(positions), channels), bins.new_empty(len(b3), channels)
-        activations = bins.new_empty(len(bins) * len(positions), channels)
-        result = bins.new_empty(len(bins), places[-1])
-        of_range = tuple(value.numpy() for value in convolutions), w3.view(len(b3), -1, channels).numpy(), b3.numpy()
-        kept = heard.numpy(), silent.numpy(), activations.numpy()
-        _range_layers(bins.numpy(), positions, *of_range, *kept, result.numpy())
-        for vector, weight, bias, first in zip(vectors, weights, biases, places[:-1], strict=True):
-            _linear(vector.numpy(), weight.numpy(), bias.numpy(), first, result.numpy())
-        ctx.save_for_backward(bins, *convolutions, w3, heard, silent, activations, result, *vectors)
-        ctx.positions, ctx.places = positions, places
-        return result
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        bins, w1, b1, w2, b2, w3, heard, silent, activations, result, *vectors = ctx.saved_tensors
-        d_biases = result.new_empty(result.shape[1])
-        slopes = _where_active(gradient.contiguous().numpy(), result.numpy(), d_biases.numpy())
-        d_w3, (d_b3, *d_others) = torch.empty_like(w3), d_biases.tensor_split(ctx.places[:-1].tolist())
-        d_convolutions = [torch.empty_like(value) for value in (w1, b1, w2, b2)]
-        _range_gradient(
-            slopes,
-            bins.numpy(),
-            ctx.positions,
-            tuple(value.numpy() for value in (w1, b1, w2, b2)),
-            *(value.numpy() for value in (heard, silent, activations)),
-            tuple(value.numpy() for value in d_convolutions),
-            d_w3.view(len(d_b3), -1, len(b1)).numpy(),
-            d_b3.numpy(),
-        )
-        d_layers: list[Tensor] = []
-        for vector, d_bias, first in zip(vectors, d_others, ctx.places[:-1], strict=True):
-            d_weight = vector.new_empty(len(d_bias), vector.shape[1])
-            transposed_times(slopes[:, first : first + len(d_bias)], vector.numpy(), d_weight.numpy(), False)
-            d_layers += [d_weight, d_bias]
-        return None, None, *d_convolutions, d_w3, d_b3, *d_layers
-
-
-def observation_features(
-    bins: Tensor,
-    vectors: Sequence[Tensor],
-    range_layers: tuple[nn.Conv1d, nn.Conv1d, nn.Linear],
-    vector_layers: Sequence[nn.Module],
-) -> Tensor:
-    """Return the rectified layers' outputs side by side, those of the bins first, ``[n, features]``.
-
-    Bins that are 0 in the whole batch cost nothing where their windows hold no other: a narrow sensor's do.
-
-    Args:
-        bins: ``[n, bins]``, at least one; data, so no gradient flows to them, nor to the vectors.
-        vectors: ``[n, size]`` each.
-        range_layers: a convolution of kernel 5 and stride 2 with one input channel, one of kernel 3 and stride
-            2, and a linear layer that reads the positions of the second, position by position; rectifiers between.
-        vector_layers: a linear layer for each vector.
-    """
-    parameters = [p for layer in (*range_layers, *vector_layers) for p in (layer.weight, layer.bias)]
-    vectors = [vector.contiguous() for vector in vectors]
-    return _ObservationFeatures.apply(bins.contiguous(), vectors, *parameters)
+    return min(observations, max(1, ROWS_PER_BLOCK // positions))
