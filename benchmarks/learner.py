@@ -6,7 +6,9 @@ so that whatever else the machine does meets all of them, and medians over the t
 """
 
 import argparse
+import ctypes
 import json
+import math
 import os
 import subprocess
 import sys
@@ -22,8 +24,15 @@ BATCHES: dict[str, tuple[list[str], int, int]] = {
     "paper": (["preset=paper"], 1, 3),
     "laptop": (["preset=laptop"], 5, 7),
 }
-#: Which learners take turns: name to (registry row, whether it is the product's).
-PLAYERS = {"product": ("rcdsac_pow", True), "reference": ("rcdsac_pow", False), "sac": ("sac", True)}
+#: Name of a learner to (registry row, whether it is the product's).
+PLAYERS = {
+    "product": ("rcdsac_pow", True),
+    "reference": ("rcdsac_pow", False),
+    "sac": ("sac", True),
+    "counter": ("rcdsac_pow", True),
+}
+#: Which of them take turns; the other one counts operations, which takes its time.
+TURNS = ("product", "reference", "sac")
 
 
 # ------------------------------------------------------------------------------------------------ the parent
@@ -63,16 +72,16 @@ def compare(overrides: list[str], updates: int, turns: int) -> dict[str, Any]:
     from bench_common import median
 
     players = {name: Player(name, overrides) for name in PLAYERS}
-    took: dict[str, list[float]] = {name: [] for name in players}
+    took: dict[str, list[float]] = {name: [] for name in TURNS}
     peaks = []
     try:
-        for player in players.values():
-            player.ask("updates", 2)  # compiled passes, optimiser states
+        for name in TURNS:
+            players[name].ask("updates", 2)  # compiled passes, optimiser states
         for _ in range(turns):
-            for name, player in players.items():
-                took[name].append(player.ask("updates", updates) / updates)
+            for name, seconds in took.items():
+                seconds.append(players[name].ask("updates", updates) / updates)
             peaks.append(players["product"].ask("peak"))
-        flops = players["product"].ask("flops")
+        flops = players["counter"].ask("flops")
         facts = players["product"].ask("facts")
         parts = players["product"].ask("parts", 3 * updates)
     finally:
@@ -139,6 +148,7 @@ def play(name: str, overrides: list[str]) -> None:
     from bench_common import gemm_peak, make_learner, seconds
     from reference import ReferenceLearner
 
+    in_passes = count_products() if name == "counter" else None
     learner = make_learner(row, overrides)
     if not is_product:
         learner = ReferenceLearner(learner)
@@ -160,7 +170,7 @@ def play(name: str, overrides: list[str]) -> None:
     answers: dict[str, Callable[[int], Any]] = {
         "updates": lambda number: number * seconds(learner.update, number),
         "peak": lambda _: gemm_peak(),
-        "flops": lambda _: on_one_thread(lambda: count_flops(learner.update)),
+        "flops": lambda _: on_one_thread(lambda: count_flops(learner.update, in_passes)),
         "parts": lambda number: on_one_thread(lambda: time_parts(learner, number)),
         "facts": lambda _: facts,
     }
@@ -169,10 +179,37 @@ def play(name: str, overrides: list[str]) -> None:
         print(json.dumps(answers[what](number)), flush=True)
 
 
-def count_flops(call: Callable[[], Any]) -> int:
+def count_products() -> Callable[[], int]:
+    """Count the operations of products within compiled passes that this process is yet to load; return the counter."""
+    from rcdsac_trl.agent import products
+
+    routine_type = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 13)
+    total = 0
+
+    def counting(routine: Callable[..., None]) -> Callable[..., None]:
+        def counted(*addresses: int) -> None:
+            nonlocal total
+            total += 2 * math.prod(ctypes.c_int.from_address(address).value for address in addresses[2:5])
+            routine(*addresses)
+
+        return counted
+
+    for name in products.ROUTINES.values():
+        address = products.find(name, in_torch=products.LIBRARY == "torch's")
+        callback = routine_type(counting(routine_type(address)))
+        _CALLBACKS.append(callback)
+        products.bind(name, ctypes.cast(callback, ctypes.c_void_p).value)
+    return lambda: total
+
+
+# Compiled passes call these as long as the process lives.
+_CALLBACKS: list[Any] = []
+
+
+def count_flops(call: Callable[[], Any], in_passes: Callable[[], int] | None = None) -> int:
     """Count the floating-point operations of all matrix products and convolutions in a call; nothing else counts.
 
-    What the call does on threads of its own is not seen.
+    What the call does on threads of its own is not seen, nor, without their counter, what compiled passes multiply.
     """
     import torch
     from torch.utils._python_dispatch import TorchDispatchMode
@@ -190,9 +227,10 @@ def count_flops(call: Callable[[], Any]) -> int:
             self.total += 0 if rule is None else rule(*args, **(kwargs or {}), out_val=result)
             return result
 
+    before = 0 if in_passes is None else in_passes()
     with Counter() as counter:
         call()
-    return counter.total
+    return counter.total + (0 if in_passes is None else in_passes() - before)
 
 
 def time_parts(learner: Any, updates: int) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -70,7 +71,23 @@ def test_learner(load: Any) -> None:
     assert program.count_flops(learner.update) > 0
     parts = program.time_parts(learner, 1)
     assert "encoders" in parts
-    assert program.PLAYERS
+    assert set(program.TURNS) < set(program.PLAYERS)
+
+
+def test_products_of_compiled_passes_are_counted() -> None:
+    # In a process that has loaded no pass yet.
+    code = """
+import numpy as np
+from learner import count_products
+counted = count_products()
+from rcdsac_trl.agent.products import times
+for size in (4, 8):
+    out = np.zeros((3, 5), np.float32)
+    times(np.ones((3, size), np.float32), np.ones((size, 5), np.float32), out, False)
+    print(counted(), out.min(), out.max())
+"""
+    found = subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["120", "4.0", "4.0", "360", "8.0", "8.0"]
 
 
 def test_scaling(load: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

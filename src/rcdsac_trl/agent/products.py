@@ -6,6 +6,7 @@ whose threads torch knows nothing of.
 
 Public names::
 
+    find(routine, in_torch), bind(routine, address)             where a routine is, and who is called
     LIBRARY                     which BLAS it is: "torch's" or, where torch's cannot be called, "SciPy's"
     times(a [m,k], b [k,n], out [m,n], add)                     out = a @ b; compiled, as are the other two
     times_transposed(a [m,k], b [n,k], out [m,n], add)          out = a @ b.T
@@ -28,6 +29,7 @@ from numba.extending import get_cython_function_address, intrinsic
 
 #: BLAS's names of the product of two matrices, by their type.
 ROUTINES = {types.float32: "sgemm", types.float64: "dgemm"}
+_NAME = "rcdsac_trl_{}"
 
 
 def find(routine: str, *, in_torch: bool) -> int | None:
@@ -41,18 +43,23 @@ def find(routine: str, *, in_torch: bool) -> int | None:
     return None
 
 
-def _name_routines() -> str:
-    """Give compiled code the routines under names of ours, which its cache keeps, and return whose they are."""
-    addresses = [find(routine, in_torch=True) for routine in ROUTINES.values()]
-    whose = "torch's"
-    if None in addresses:
-        addresses, whose = [find(routine, in_torch=False) for routine in ROUTINES.values()], "SciPy's"
-    for routine, address in zip(ROUTINES.values(), addresses, strict=True):
-        llvmlite.binding.add_symbol(f"rcdsac_trl_{routine}", address)
+def bind(routine: str, address: int) -> None:
+    """Let compiled passes that are yet to be loaded call a routine there, under a name of ours that caches keep."""
+    llvmlite.binding.add_symbol(_NAME.format(routine), address)
+
+
+def _bind_all() -> str:
+    """Bind the routines of one library and return whose it is."""
+    whose, addresses = "torch's", {routine: find(routine, in_torch=True) for routine in ROUTINES.values()}
+    if None in addresses.values():
+        whose, addresses = "SciPy's", {routine: find(routine, in_torch=False) for routine in ROUTINES.values()}
+    for routine, address in addresses.items():
+        assert address is not None  # SciPy has them all
+        bind(routine, address)
     return whose
 
 
-LIBRARY = _name_routines()
+LIBRARY = _bind_all()
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _intrinsic: Any = intrinsic  # the caller does not pass the first argument, which its type does not say
 
@@ -107,7 +114,7 @@ def _gemm(
         ]
         pointer = cgutils.voidptr_t
         routine = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [pointer] * 13), f"rcdsac_trl_{ROUTINES[kind]}"
+            builder.module, ir.FunctionType(ir.VoidType(), [pointer] * 13), _NAME.format(ROUTINES[kind])
         )
         builder.call(routine, [builder.bitcast(argument, pointer) for argument in arguments])
         return context.get_dummy_value()
