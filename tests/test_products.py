@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from rcdsac_trl.agent import products
 from rcdsac_trl.agent.products import times, times_transposed, transposed_times
@@ -84,3 +85,13 @@ def test_either_librarys_routine_multiplies(in_torch: bool) -> None:
     ]
     ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 13)(address)(*by_address)
     assert out[0] == 11.0
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_room_begins_where_torchs_tensors_do(kind: type) -> None:
+    for size in range(1, 40):  # of many sizes, some would not by themselves
+        given = products.room((size, 3), np.zeros(1, kind))
+        assert (given.shape, given.dtype) == ((size, 3), np.dtype(kind))
+        assert given.ctypes.data % 64 == 0
+        given[:] = 1.0
+        assert torch.empty(size).data_ptr() % 64 == 0

@@ -8,7 +8,7 @@ bias of the first and of the second.
 import numba
 import numpy as np
 
-from rcdsac_trl.agent.products import times, times_transposed, transposed_times
+from rcdsac_trl.agent.products import room, times, times_transposed, transposed_times
 
 #: Windows of the second convolution that go through the layers together: their inputs and activations take some 2 MB.
 ROWS_PER_BLOCK = 96 * 43
@@ -133,7 +133,7 @@ def _by_tap(w1: np.ndarray, w2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for c in range(w1.shape[0]):
         for k in range(w1.shape[2]):
             taps[k, c] = w1[c, 0, k]
-    kernel = np.empty((_SEEN * channels, w2.shape[0]), w2.dtype)
+    kernel = room((_SEEN * channels, w2.shape[0]), w2)
     for o in range(w2.shape[0]):
         for i in range(channels):
             for s in range(_SEEN):
@@ -161,7 +161,7 @@ def range_layers(
     _, quiet = _silent_activations(w2, b1, b2)
     offset = b3 + (silent * quiet).sum(1)
     size = _block(bins.shape[0], number)
-    windows = np.empty((size * number, kernel.shape[0]), bins.dtype)
+    windows = room((size * number, kernel.shape[0]), bins)
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
         window, rows = windows[: (stop - start) * number], activations[start * number : stop * number]
@@ -196,7 +196,7 @@ def _rectify(out: np.ndarray, first: int, bias: np.ndarray) -> None:
 def where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> np.ndarray:
     """Return the gradient where out is active, and write its sums."""
     zero = out.dtype.type(0)
-    result = np.empty_like(out)
+    result = room(out.shape, out)
     d_bias[:] = zero
     for r in range(out.shape[0]):
         row, slopes, values = result[r], gradient[r], out[r]
@@ -223,11 +223,12 @@ def range_gradient(
     (w1, b1, w2, b2), (d_w1, d_b1, d_w2, d_b2) = convolutions, d_convolutions
     number, zero, channels = positions.size, bins.dtype.type(0), b1.size
     taps, kernel = _by_tap(w1, w2)
-    d_taps, d_kernel, d_heard = np.zeros_like(taps), np.zeros_like(kernel), np.zeros_like(heard)
+    d_taps, d_kernel, d_heard = np.zeros_like(taps), room(kernel.shape, bins), room(heard.shape, bins)
+    d_kernel[:], d_heard[:] = zero, zero
     d_b1[:], d_b2[:] = zero, zero
     size = _block(bins.shape[0], number)
-    windows = np.empty((size * number, kernel.shape[0]), bins.dtype)
-    d_windows, d_activations = np.empty_like(windows), np.empty_like(activations[: size * number])
+    windows = room((size * number, kernel.shape[0]), bins)
+    d_windows, d_activations = room(windows.shape, bins), room((size * number, channels), bins)
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
         window, d_window = windows[: (stop - start) * number], d_windows[: (stop - start) * number]

@@ -11,6 +11,7 @@ Public names::
     times(a [m,k], b [k,n], out [m,n], add)                     out = a @ b; compiled, as are the other two
     times_transposed(a [m,k], b [n,k], out [m,n], add)          out = a @ b.T
     transposed_times(a [k,m], b [k,n], out [m,n], add)          out = a.T @ b
+    room(shape, like) -> array                                  for matrices that compiled passes make
 """
 
 import ctypes
@@ -60,6 +61,8 @@ def _bind_all() -> str:
 
 
 LIBRARY = _bind_all()
+# Bytes, a multiple of which the places of torch's tensors are, too; numba's own arrays begin at half of that.
+_ALIGNMENT = 64
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _intrinsic: Any = intrinsic  # the caller does not pass the first argument, which its type does not say
 
@@ -139,6 +142,17 @@ def _check(fits: bool, a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
 def _leading(a: np.ndarray) -> int:
     """Return the distance of two rows in elements."""
     return max(a.strides[0] // a.itemsize, a.shape[1], 1)
+
+
+@_compiled
+def room(shape: tuple[int, ...], like: np.ndarray) -> np.ndarray:
+    """Return an array of like's type, its elements not set; where a matrix begins may decide how BLAS rounds."""
+    size, elements = 1, _ALIGNMENT // like.itemsize
+    for number in shape:
+        size *= number
+    wider = np.empty(size + elements, like.dtype)
+    first = -(wider.ctypes.data // like.itemsize) % elements
+    return wider[first : first + size].reshape(shape)
 
 
 # BLAS goes column by column, so that it sees every matrix transposed, and is asked for the transposed product.

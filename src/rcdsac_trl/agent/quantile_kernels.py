@@ -7,7 +7,7 @@ have N fractions each; H features, C cosines. What is constant along a sequence 
 import numba
 import numpy as np
 
-from rcdsac_trl.agent.products import times, times_transposed, transposed_times
+from rcdsac_trl.agent.products import room, times, times_transposed, transposed_times
 
 #: Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
 ROWS_PER_BLOCK = 1024
@@ -185,7 +185,7 @@ def layers(
     sequences, steps, number = values.shape
     times_transposed(_rows(cosines), gate_weight, _rows(tau_gate), False)
     size = _block(steps * number, sequences)
-    product = np.empty((size, steps, number, x.shape[2]), x.dtype)
+    product = room((size, steps, number, x.shape[2]), x)
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         first = start if hidden.shape[0] >= sequences else 0
@@ -214,8 +214,9 @@ def layers_gradient(
     """Add the gradients of all layers; those of weight and bias lack the output's weight, a factor of each row."""
     sequences, steps, number = slopes.shape
     size = _block(steps * number, sequences)
-    product, d_hidden = np.empty((size, steps, number, x.shape[2]), x.dtype), np.empty_like(hidden[:size])
-    d_tau_gate = np.zeros_like(tau_gate)
+    product, d_hidden = room((size, steps, number, x.shape[2]), x), room((size, *hidden.shape[1:]), x)
+    d_tau_gate = room(tau_gate.shape, x)
+    d_tau_gate[:] = 0
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         factors, d_inner = product[: stop - start], _rows(d_hidden[: stop - start])
@@ -246,8 +247,8 @@ def gradient_of_features(
     """Add the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
     sequences, steps, number = slopes.shape
     size = _block(steps * number, sequences)
-    d_hidden = np.empty((size * steps, number, hidden.shape[3]), hidden.dtype)
-    d_product = np.empty((size * steps, number, d_x.shape[2]), d_x.dtype)
+    d_hidden = room((size * steps, number, hidden.shape[3]), d_x)
+    d_product = room((size * steps, number, d_x.shape[2]), d_x)
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         sloping = _sloping_gradient(slopes[start:stop], hidden[start:stop], d_hidden)

@@ -20,7 +20,7 @@ from numba.extending import overload
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rcdsac_trl.agent.products import times, times_transposed, transposed_times
+from rcdsac_trl.agent.products import room, times, times_transposed, transposed_times
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
@@ -140,7 +140,8 @@ def _steps_gradient(
     d_b_re: np.ndarray,
 ) -> None:
     """Write the gradients of the inputs and of the weights."""
-    d_inputs, d_recurrent, carried = np.empty_like(gates), np.empty_like(gates), np.zeros_like(states[0])
+    d_inputs, d_recurrent, carried = room(gates.shape, x), room(gates.shape, x), room(states.shape[1:], x)
+    carried[:] = 0
     for t in range(len(gates) - 1, -1, -1):
         _step_gradient(gradient[t], carried, gates[t], recurrent[t], states[t], d_inputs[t], d_recurrent[t])
         if t > 0:
