@@ -62,7 +62,8 @@ def test_what_is_published_drives_and_is_reported_on(evaluated: Path, tmp_path: 
     mean = episodes.table.loc[episodes.table["beta"] == -2.0, "collisions"].mean()
     (line,) = [line for line in card.splitlines() if "β = -2" in line]
     assert f"| {mean:.2f} [" in line
-    assert "## Limits" in card
+    assert "\n\n## Limits\n\n" in card
+    assert "\n\n\n" not in card
     assert not pd.read_csv(results / "training_episodes.csv").empty
 
 

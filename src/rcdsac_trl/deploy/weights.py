@@ -287,6 +287,7 @@ def model_card(weights: Weights, results: str = "") -> str:
     if config.fixed_beta is not None:
         told += f"; it was trained for beta = {config.fixed_beta:g} alone"
     origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items() if value is not None)
+    driving = f"\n{results.strip()}\n" if results else ""
     return f"""# {config.name}, {config.sensor} sensor
 
 A navigation agent of [rcdsac_trl](https://pypi.org/project/rcdsac-trl/): recurrent actor and {config.num_critics}
@@ -306,8 +307,7 @@ policy = rcdsac_trl.load("this/folder")
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |
 | gives | linear velocity in m/s, angular velocity in rad/s |
 {origin}
-
-{results}
+{driving}
 ## Limits
 
 Trained in simulation only, on a differential-drive robot of 0.25 m radius. It has driven no real robot: keep the

@@ -83,7 +83,7 @@ class Publication:
                     target = self.results / name / path
                     target.parent.mkdir(parents=True, exist_ok=True)
                     durable.write(target, (agent.run / path).read_bytes())
-            files = packed(small, half=True, results=f"{describe(agent.evaluation)}\n{stored}")
+            files = packed(small, half=True, results=f"{describe(agent.evaluation).strip()}\n\n{stored}")
             (self.weights / name).mkdir(parents=True, exist_ok=True)
             for file, content in files.items():
                 durable.write(self.weights / name / file, content)
