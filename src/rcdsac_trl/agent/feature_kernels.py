@@ -155,7 +155,7 @@ def range_layers(
 ) -> None:
     """Write the features into out's first columns, and what the way back reads of heard and silent positions."""
     w1, b1, w2, b2 = convolutions
-    number, zero, features = positions.size, bins.dtype.type(0), b3.size
+    number, features = positions.size, b3.size
     taps, kernel = _by_tap(w1, w2)
     _divide(by_position, positions, heard, silent)
     _, quiet = _silent_activations(w2, b1, b2)
@@ -167,10 +167,7 @@ def range_layers(
         window, rows = windows[: (stop - start) * number], activations[start * number : stop * number]
         _first_layer(bins[start:stop], positions, taps, b1, window)
         times(window, kernel, rows, False)
-        for r in range(rows.shape[0]):
-            row = rows[r]
-            for c in range(row.size):
-                row[c] = max(row[c] + b2[c], zero)
+        _rectify(rows, 0, b2)
         times_transposed(rows.reshape(stop - start, -1), _flat(heard), out[start:stop, :features], False)
     _rectify(out, 0, offset)
 

@@ -295,8 +295,7 @@ class DistributionalSACLoss(LinkedLoss):
         return risk[:, :1] if risk.stride(1) == 0 else risk
 
     def _act(self, memory: Tensor, risk: Tensor | None, noise: Tensor) -> tuple[Tensor, Tensor]:
-        # Layers call one product for each sequence where its rows do not follow the last one's.
-        entries = {self.actor_network[0].out_keys[0]: memory.contiguous(), self.tensor_keys.risk: risk}
+        entries = {self.actor_network[0].out_keys[0]: memory, self.tensor_keys.risk: risk}
         loc, scale = call_module(self.actor_network[1], entries)
         return squash(loc, scale, noise)
 

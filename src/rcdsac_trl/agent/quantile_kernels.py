@@ -184,7 +184,7 @@ def layers(
     """Write the gates, the hidden layer and the values; hidden may have room for some sequences alone."""
     sequences, steps, number = values.shape
     times_transposed(_rows(cosines), gate_weight, _rows(tau_gate), False)
-    size = _block(steps * number, sequences)
+    size = block(steps * number, sequences)
     product = room((size, steps, number, x.shape[2]), x)
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
@@ -213,7 +213,7 @@ def layers_gradient(
 ) -> None:
     """Add the gradients of all layers; those of weight and bias lack the output's weight, a factor of each row."""
     sequences, steps, number = slopes.shape
-    size = _block(steps * number, sequences)
+    size = block(steps * number, sequences)
     product, d_hidden = room((size, steps, number, x.shape[2]), x), room((size, *hidden.shape[1:]), x)
     d_tau_gate = room(tau_gate.shape, x)
     d_tau_gate[:] = 0
@@ -246,7 +246,7 @@ def gradient_of_features(
 ) -> None:
     """Add the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
     sequences, steps, number = slopes.shape
-    size = _block(steps * number, sequences)
+    size = block(steps * number, sequences)
     d_hidden = room((size * steps, number, hidden.shape[3]), d_x)
     d_product = room((size * steps, number, d_x.shape[2]), d_x)
     for start in range(0, sequences, size):
@@ -257,7 +257,7 @@ def gradient_of_features(
 
 
 @_compiled
-def _block(rows: int, sequences: int) -> int:
+def block(rows: int, sequences: int) -> int:
     """Return how many sequences of so many rows each go through the layers together."""
     return min(sequences, max(1, ROWS_PER_BLOCK // rows))
 

@@ -63,7 +63,7 @@ class _QuantileValues(torch.autograd.Function):
         keep, blocks = any(ctx.needs_input_grad), _gate_blocks(tau)
         # What nothing goes back through needs no place of its own.
         gated = sequences if keep else blocks[0].stop
-        inner = sequences if keep else min(gated, max(1, kernels.ROWS_PER_BLOCK // (steps * number)))
+        inner = sequences if keep else kernels.block(steps * number, gated)
         cosines = memory.new_empty(gated, shared, number, len(frequencies))
         tau_gate = memory.new_empty(gated, shared, number, len(w_tau))
         hidden = memory.new_empty(inner, steps, number, len(weight))
@@ -121,7 +121,7 @@ class _QuantileValues(torch.autograd.Function):
 
 def _gate_blocks(gates: Tensor) -> list[slice]:
     """Cut the sequences ``[B, L|1, N, ..]`` into blocks whose gates are computed together."""
-    size = max(1, kernels.ROWS_PER_BLOCK // gates.shape[1:3].numel())
+    size = kernels.block(gates.shape[1:3].numel(), len(gates))
     return [slice(start, min(start + size, len(gates))) for start in range(0, len(gates), size)]
 
 
