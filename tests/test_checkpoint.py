@@ -337,6 +337,22 @@ def test_a_damaged_best_one_is_named(tmp_path: Path) -> None:
     assert find(tmp_path, "last")[0].progress.iterations == 3
 
 
+def test_a_checkpoint_goes_by_its_iterations(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, {"number": Number(1.0)}, replay=None, keep=2)
+    for iterations in range(4):
+        checkpoints.save(progress(iterations, best=0 if iterations else None), {})
+    assert [find(tmp_path, n)[0].progress.iterations for n in (0, 2, 3)] == [0, 2, 3]
+    with pytest.raises(UserInputError) as caught:
+        find(tmp_path, 1)
+    assert str(caught.value) == (
+        f"checkpoint=1 is not in {tmp_path}, which holds iteration-000000, iteration-000002, iteration-000003: "
+        "a training keeps more with checkpoint.keep"
+    )
+    flip(tmp_path / STATE.replace("3", "2", 1))
+    with pytest.raises(UserInputError, match=r"^checkpoint .*iteration-000002 is damaged: .*checkpoint=last is whole$"):
+        find(tmp_path, 2)
+
+
 def test_a_missing_checkpoint_is_one_sentence(tmp_path: Path) -> None:
     told = f"there is no checkpoint in {tmp_path}: has this run saved one yet?"
     for call in (lambda: load_progress(tmp_path, "best"), lambda: load_weights(tmp_path, "last", loss=make(0))):

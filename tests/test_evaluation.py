@@ -363,6 +363,7 @@ def test_the_named_checkpoint_drives(run: Path, tmp_path: Path) -> None:
             value.mul_(2.0)
     checkpoints.save(replace(best_progress, iterations=91), {})
     assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'other'}"))["episodes.csv"] != best
+    assert contents(evaluate(*given, "checkpoint=90", f"out={tmp_path / 'then'}"))["episodes.csv"] == best
     assert contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"] == best
 
 

@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from rcdsac_trl.deploy import Policy
 from rcdsac_trl.deploy.weights import Weights, halved, packed
@@ -29,7 +28,7 @@ class PublishSettings:
     """The root of ``conf/publish.yaml``."""
 
     runs: tuple[str, ...]
-    checkpoint: Literal["best", "last"]
+    checkpoint: Name
     weights: str
     results: str
 

@@ -15,6 +15,7 @@ from rcdsac_trl.pipeline.adaptive import ControllerSettings
 from rcdsac_trl.pipeline.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.pipeline.drivers import resolve_processes
 from rcdsac_trl.pipeline.film import VideoSettings
+from rcdsac_trl.pipeline.saved import Name
 from rcdsac_trl.pipeline.settings import AlgoSettings, LearnerSettings, Schedule, WorldSettings
 from rcdsac_trl.world.maps import MapSettings
 from rcdsac_trl.world.task import TaskSettings
@@ -168,7 +169,7 @@ class ExportSettings:
     """The root of ``conf/export.yaml``."""
 
     run: str | None
-    checkpoint: Literal["best", "last"]
+    checkpoint: Name
     out: str | None
     num_quantiles: int
 
@@ -188,7 +189,7 @@ class EvaluationSettings:
     collision_weight: tuple[float, ...] | None
     beta_controller: tuple[Literal["clearance", "tail_variance", "bandit"], ...] | None
     controller: ControllerSettings
-    checkpoint: Literal["best", "last"]
+    checkpoint: Name
     baseline: Literal["pursuit"] | None
     split: Literal["evaluation", "validation"]
     seed: int
@@ -274,7 +275,7 @@ class CalibrationSettings:
 
     run: str | None
     beta: tuple[float, ...] | None
-    checkpoint: Literal["best", "last"]
+    checkpoint: Name
     split: Literal["evaluation", "validation"]
     seed: int
     num_maps: int

@@ -2,7 +2,7 @@
 
 A checkpoint's record (``checkpoint.json``) holds the SHA-256 of every file in its folder, the files of the replay, the
 lengths of the logs and the progress, which names the best checkpoint so far. So no pointer has to be kept in step:
-``last`` is the newest checkpoint that is whole, ``best`` the one it names.
+``last`` is the newest checkpoint that is whole, ``best`` the one it names; any other goes by its iterations.
 """
 
 import json
@@ -21,7 +21,8 @@ CHECKPOINTS = "checkpoints"
 """The folder of a run's checkpoints, in the run folder."""
 _RECORD = "checkpoint.json"
 
-Name = Literal["best", "last"]
+Name = Literal["best", "last"] | int
+"""How users name a checkpoint; a number: by the iterations that were done."""
 
 
 class DamagedError(Exception):
@@ -109,21 +110,28 @@ def newest(folder: Path, *, replay: Path | None = None) -> tuple[Saved, list[str
 
 
 def find(folder: Path, name: Name) -> tuple[Saved, list[str]]:
-    """Find the checkpoint ``last`` or ``best`` of a run; see :func:`newest`.
+    """Find a checkpoint of a run; see :func:`newest`.
 
     Raises:
-        UserInputError: as :func:`newest`, and if the best one does not exist or is damaged.
+        UserInputError: as :func:`newest`, and if the named one does not exist or is damaged.
     """
     last, damaged = newest(folder)
     if name == "last":
         return last, damaged
-    if last.progress.best_iterations is None:
+    iterations = last.progress.best_iterations if name == "best" else name
+    if iterations is None:
         raise UserInputError(f"there is no best checkpoint in {folder}: has this run validated yet?")
-    path = folder / folder_name(last.progress.best_iterations)
+    path = folder / folder_name(iterations)
+    if name != "best" and not path.is_dir():
+        kept = ", ".join(path.name for path in folders(folder))
+        raise UserInputError(
+            f"checkpoint={name} is not in {folder}, which holds {kept}: a training keeps more with checkpoint.keep"
+        )
     try:
         return checked(path), damaged
     except DamagedError as error:
-        raise UserInputError(f"the best checkpoint {path} is damaged: {error}; checkpoint=last is whole") from error
+        which = "the best checkpoint" if name == "best" else "checkpoint"
+        raise UserInputError(f"{which} {path} is damaged: {error}; checkpoint=last is whole") from error
 
 
 def load_progress(folder: Path, name: Name) -> Progress:

@@ -63,7 +63,7 @@ def export(cfg: DictConfig) -> Export:
     check_extra()
     assert settings.run is not None
     weights = weights_of_run(Path(settings.run), settings.checkpoint)
-    default_out = Path(settings.run) / "export" / settings.checkpoint
+    default_out = Path(settings.run) / "export" / str(settings.checkpoint)
     out = default_out if settings.out is None else Path(settings.out)
     check_writable(out)
     if out.is_dir() and any(out.iterdir()):

@@ -26,7 +26,7 @@ def weights_of_run(folder: Path, checkpoint: Name) -> Weights:
 
     Args:
         folder: of the run.
-        checkpoint: ``"best"`` or ``"last"``.
+        checkpoint: ``"best"``, ``"last"``, or the iterations done.
 
     Raises:
         UserInputError: if there is no such run or checkpoint, or its weights do not fit its config.
