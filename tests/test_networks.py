@@ -67,13 +67,13 @@ def test_range_features_equal_the_layers(number: int, heard: list[int]) -> None:
 
 def test_silent_bins_are_left_out() -> None:
     bins = np.zeros((3, 180), np.float32)
-    assert feature_kernels.heard(bins + 1.0, 5).tolist() == list(range(43))
+    assert feature_kernels.heard_positions(bins + 1.0, 5).tolist() == list(range(43))
     # Bins 0..20 reach positions 0..10 of the first convolution and 0..5 of the second; 158..179 reach 77..87, 38..42.
     bins[1, NARROW] = 1.0
-    assert feature_kernels.heard(bins, 5).tolist() == [*range(6), *range(38, 43)]
+    assert feature_kernels.heard_positions(bins, 5).tolist() == [*range(6), *range(38, 43)]
     # Bin 0 reaches position 0, bin 14 reaches 2 and 3.
-    assert feature_kernels.heard(np.eye(180, dtype=np.float32)[[0, 14]], 5).tolist() == [0, 2, 3]
-    assert feature_kernels.heard(0.0 * bins, 5).tolist() == [0]
+    assert feature_kernels.heard_positions(np.eye(180, dtype=np.float32)[[0, 14]], 5).tolist() == [0, 2, 3]
+    assert feature_kernels.heard_positions(0.0 * bins, 5).tolist() == [0]
 
 
 @pytest.mark.parametrize(("rows", "steps"), [(1, 1), (1, 4), (3, 1), (5, 6)])

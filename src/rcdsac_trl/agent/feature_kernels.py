@@ -19,7 +19,7 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"c
 
 
 @_compiled
-def heard(bins: np.ndarray, taps: int) -> np.ndarray:
+def heard_positions(bins: np.ndarray, taps: int) -> np.ndarray:
     """Return the positions of the second convolution that see a bin which is not 0 in all the batch, or the first."""
     sounds = np.zeros(bins.shape[1], np.uint8)
     for o in range(bins.shape[0]):

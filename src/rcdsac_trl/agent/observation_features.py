@@ -34,7 +34,7 @@ class _ObservationFeatures(torch.autograd.Function):
         *convolutions, w3, b3 = parameters[:6]
         weights, biases = parameters[6::2], parameters[7::2]
         channels, places = len(convolutions[0]), np.cumsum([len(b3), *map(len, biases)])
-        positions = kernels.heard(bins.numpy(), convolutions[0].shape[2])
+        positions = kernels.heard_positions(bins.numpy(), convolutions[0].shape[2])
         heard, silent = bins.new_empty(len(b3), len(positions), channels), bins.new_empty(len(b3), channels)
         activations = bins.new_empty(len(bins) * len(positions), channels)
         result = bins.new_empty(len(bins), places[-1])

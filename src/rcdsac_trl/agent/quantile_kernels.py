@@ -7,6 +7,7 @@ have N fractions each; H features, C cosines. What is constant along a sequence 
 import numba
 import numpy as np
 
+from rcdsac_trl.agent.feature_kernels import linear
 from rcdsac_trl.agent.products import room, times, times_transposed, transposed_times
 
 #: Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
@@ -121,12 +122,7 @@ def _product_gradient(
 @_compiled
 def input_layer(joined: np.ndarray, weight: np.ndarray, bias: np.ndarray, x: np.ndarray) -> None:
     """Write the features ``[B, L, H]`` of memory and action side by side."""
-    rows, zero = _rows(x), x.dtype.type(0)
-    times_transposed(_rows(joined), weight, rows, False)
-    for r in range(rows.shape[0]):
-        row = rows[r]
-        for h in range(row.size):
-            row[h] = max(row[h] + bias[h], zero)
+    linear(_rows(joined), weight, bias, 0, _rows(x))
 
 
 @_compiled
