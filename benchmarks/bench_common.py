@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from rcdsac_trl.interface import sensor_mask
-from rcdsac_trl.pipeline.build import training
-from rcdsac_trl.pipeline.build.read import training_settings
-from rcdsac_trl.pipeline.cli import compose
-from rcdsac_trl.pipeline.learner import Learner
+from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.seeding import torch_stream
+from rcdsac_trl.training import setup
+from rcdsac_trl.training.learner import Learner
 
 EPISODES = 20
 
@@ -23,7 +23,7 @@ EPISODES = 20
 def make_learner(algo: str, overrides: list[str]) -> Learner:
     """Make the learner of a training, its replay filled with random episodes of the configured sensor."""
     settings = training_settings(compose("train", [f"+algo={algo}", *overrides, "replay.capacity_steps=20000"]))
-    learner = training.make_learner(settings, "cpu")
+    learner = setup.make_learner(settings, "cpu")
     mask = torch.from_numpy(sensor_mask(settings.sensor.name))
     learner.replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask))
     return learner

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.system import runtime
 
 NUM_AGENTS = 10
 
@@ -52,9 +52,9 @@ def record(env: Any, episode: int, steps: int) -> Recording:
     """
     import torch
 
+    from rcdsac_trl.rollout.planners.pursuit import pursuit_action
     from rcdsac_trl.seeding import torch_stream
-    from rcdsac_trl.world import simulation
-    from rcdsac_trl.world.pursuit import pursuit_action
+    from rcdsac_trl.world.sim import simulation
 
     recording = Recording(calls=[[] for _ in range(len(env.agents))])
     generator = torch_stream(0, "benchmark", episode)
@@ -106,7 +106,7 @@ def only_bullet(env: Any, recording: Recording) -> None:
     and contacts. The agents take turns after each agent step, as in every environment, which is told an action of each
     of them at a time; one agent's whole episode at once would keep its simulation in the processor's cache.
     """
-    from rcdsac_trl.world.bullet import pybullet
+    from rcdsac_trl.world.sim.bullet import pybullet
 
     upright = (0.0, 0.0, 0.0, 1.0)
     agents = [

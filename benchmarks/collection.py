@@ -14,7 +14,7 @@ import bench_world as bench
 
 def bare(num_maps: int, repeats: int, steps: int) -> dict[str, float]:
     """Time the environment and PyBullet alone on the same episodes, by processor time."""
-    from rcdsac_trl.world.env import NavigationEnv
+    from rcdsac_trl.world.task.env import NavigationEnv
 
     env = NavigationEnv(agent_ids=range(bench.NUM_AGENTS))
     taken: dict[str, list[list[float]]] = {"reset": [], "drive": [], "bullet": []}
@@ -61,11 +61,11 @@ def collected(overrides: list[str], batches: int, *, wall: bool) -> float:
     Returns:
         Agent steps a second.
     """
-    from rcdsac_trl.pipeline.build.collection import make_episodes
-    from rcdsac_trl.pipeline.build.read import training_settings
-    from rcdsac_trl.pipeline.build.training import make_learner
-    from rcdsac_trl.pipeline.cli import compose
-    from rcdsac_trl.pipeline.saved import Progress
+    from rcdsac_trl.config.compose import compose
+    from rcdsac_trl.config.run_config import training_settings
+    from rcdsac_trl.rollout.make_collector import make_episodes
+    from rcdsac_trl.storage.checkpoint_record import Progress
+    from rcdsac_trl.training.setup import make_learner
 
     given = ["+algo=rcdsac_pow", "schedule.pursuit_iterations=0", *overrides]
     settings = training_settings(compose("train", given))

@@ -38,7 +38,7 @@ def main() -> None:
     import torch
 
     from rcdsac_trl.deploy import Guard, Policy, read_weights
-    from rcdsac_trl.deploy.modules import ActorStep, CriticStep
+    from rcdsac_trl.deploy.export.modules import ActorStep, CriticStep
 
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -85,19 +85,19 @@ def imported(weights: Path) -> list[Any]:
 
 def untrained(folder: Path) -> Path:
     """Write weights with the default networks."""
-    from rcdsac_trl.deploy.weights import packed
-    from rcdsac_trl.pipeline import logs
-    from rcdsac_trl.pipeline.build.agent import make_average, make_loss
-    from rcdsac_trl.pipeline.build.read import training_settings
-    from rcdsac_trl.pipeline.build.weights import weights_of_run
-    from rcdsac_trl.pipeline.checkpoint import Checkpoints
-    from rcdsac_trl.pipeline.cli import compose
-    from rcdsac_trl.pipeline.saved import Progress
+    from rcdsac_trl.config.compose import compose
+    from rcdsac_trl.config.run_config import training_settings
+    from rcdsac_trl.deploy.policy.weights import packed
+    from rcdsac_trl.release.run_weights import weights_of_run
+    from rcdsac_trl.rollout.make_agent import make_average, make_loss
+    from rcdsac_trl.storage.checkpoint import Checkpoints
+    from rcdsac_trl.storage.checkpoint_record import Progress
+    from rcdsac_trl.training import run_log
 
     cfg = compose("train", ["+algo=rcdsac_pow", "logger=none"])
     settings = training_settings(cfg)
     run, out = folder / "run", folder / "weights"
-    logs.start_run_folder(run, cfg, {})
+    run_log.start_run_folder(run, cfg, {})
     loss = make_loss(settings, "cpu")
     parts = {"loss": loss, "average": make_average(loss, settings.learner)}
     Checkpoints(run / "checkpoints", parts, replay=None, keep=1).save(Progress(), {})

@@ -20,8 +20,8 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*", default=[], help="of the training's config, as key=value")
     options = parser.parse_args()
     bench.prepare()
-    from rcdsac_trl.pipeline import build
-    from rcdsac_trl.pipeline.cli import compose
+    from rcdsac_trl.config.compose import compose
+    from rcdsac_trl.evaluation.make_evaluation import make_evaluation
 
     with tempfile.TemporaryDirectory() as folder:
         run = untrained(Path(folder) / "run", options.overrides)
@@ -32,7 +32,7 @@ def main() -> None:
             f"num_workers={options.num_workers}",
             f"num_maps={options.maps + 2}",
         ]
-        evaluation = build.evaluation(compose("evaluate", given))
+        evaluation = make_evaluation(compose("evaluate", given))
         done = [time.perf_counter() for _ in evaluation.maps()]
     # From the second map done, when every process of two is at work, to the last.
     per_map = (done[-1] - done[1]) / options.maps
@@ -51,17 +51,17 @@ def main() -> None:
 
 def untrained(folder: Path, overrides: list[str]) -> Path:
     """Write a run folder whose agent has its first weights, by default in the default world."""
-    from rcdsac_trl.pipeline import logs
-    from rcdsac_trl.pipeline.build.agent import make_average, make_loss
-    from rcdsac_trl.pipeline.build.read import training_settings
-    from rcdsac_trl.pipeline.checkpoint import Checkpoints
-    from rcdsac_trl.pipeline.cli import compose
-    from rcdsac_trl.pipeline.saved import CHECKPOINTS, Progress
+    from rcdsac_trl.config.compose import compose
+    from rcdsac_trl.config.run_config import CHECKPOINTS, training_settings
+    from rcdsac_trl.rollout.make_agent import make_average, make_loss
+    from rcdsac_trl.storage.checkpoint import Checkpoints
+    from rcdsac_trl.storage.checkpoint_record import Progress
+    from rcdsac_trl.training import run_log
 
     cfg = compose("train", ["+algo=rcdsac_pow", "logger=none", *overrides])
     settings = training_settings(cfg)
     folder.mkdir(parents=True)
-    logs.start_run_folder(folder, cfg, {})
+    run_log.start_run_folder(folder, cfg, {})
     loss = make_loss(settings, "cpu")
     average = make_average(loss, settings.learner)
     Checkpoints(folder / CHECKPOINTS, {"loss": loss, "average": average}, replay=None, keep=1).save(Progress(), {})

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.system import runtime
 
 # Mini-batch: overrides of the training's config, updates in a turn, turns.
 BATCHES: dict[str, tuple[list[str], int, int]] = {
@@ -181,7 +181,7 @@ def play(name: str, overrides: list[str]) -> None:
 
 def count_products() -> Callable[[], int]:
     """Count the operations of products within compiled passes that this process is yet to load; return the counter."""
-    from rcdsac_trl.agent import products
+    from rcdsac_trl.agent.kernels import matmul
 
     routine_type = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 13)
     total = 0
@@ -194,11 +194,11 @@ def count_products() -> Callable[[], int]:
 
         return counted
 
-    for name in products.ROUTINES.values():
-        address = products.find(name, in_torch=products.LIBRARY == "torch's")
+    for name in matmul.ROUTINES.values():
+        address = matmul.find(name, in_torch=matmul.LIBRARY == "torch's")
         callback = routine_type(counting(routine_type(address)))
         _CALLBACKS.append(callback)
-        products.bind(name, ctypes.cast(callback, ctypes.c_void_p).value)
+        matmul.bind(name, ctypes.cast(callback, ctypes.c_void_p).value)
     return lambda: total
 
 

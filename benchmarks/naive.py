@@ -14,9 +14,9 @@ import bench_world as bench
 
 def _make_naive() -> None:
     """Make every simulation of this process a naive one."""
-    from rcdsac_trl.interface import MAX_RANGE_M, NUM_BINS
-    from rcdsac_trl.world import bodies, simulation
-    from rcdsac_trl.world.bullet import pybullet
+    from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+    from rcdsac_trl.world.sim import bodies, simulation
+    from rcdsac_trl.world.sim.bullet import pybullet
 
     bodies.SHAPES_PER_BODY = 1
 
@@ -38,7 +38,7 @@ def _make_naive() -> None:
 
 def naive_env(agent_id: int) -> Any:
     """Make the environment of one agent, in a worker of its own."""
-    from rcdsac_trl.world.env import NavigationEnv
+    from rcdsac_trl.world.task.env import NavigationEnv
 
     _make_naive()
     return NavigationEnv(agent_ids=(agent_id,))
@@ -51,7 +51,7 @@ def steps_per_second(steps: int) -> float:
     import torch
     from torchrl.envs import ParallelEnv
 
-    from rcdsac_trl.world.pursuit import pursuit_action
+    from rcdsac_trl.rollout.planners.pursuit import pursuit_action
 
     makers = [partial(naive_env, agent_id) for agent_id in range(bench.NUM_AGENTS)]
     env = ParallelEnv(bench.NUM_AGENTS, makers, mp_start_method="forkserver")

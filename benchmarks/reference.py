@@ -18,10 +18,10 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.modules import GRUModule, TanhNormal
 from torchrl.objectives import LossModule, SoftUpdate
 
-from rcdsac_trl.agent.losses import DistributionalSACLoss
+from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.networks import LOG_STD_RANGE, Encoder, QuantileHead
 from rcdsac_trl.agent.risk import RiskMeasure
-from rcdsac_trl.pipeline.learner import Learner
+from rcdsac_trl.training.learner import Learner
 
 
 class Features(nn.Module):

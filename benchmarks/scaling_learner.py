@@ -8,7 +8,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rcdsac_trl.pipeline import runtime
+from rcdsac_trl.system import runtime
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 #: The laptop's mini-batch, one of whose sizes is turned.

@@ -27,7 +27,7 @@ def rates(envs: dict[float, Any], seconds_of: Callable[[Callable[[], object]], f
     """
     import torch
 
-    from rcdsac_trl.world.pursuit import pursuit_action
+    from rcdsac_trl.rollout.planners.pursuit import pursuit_action
 
     now = {key: env.reset() for key, env in envs.items()}
     fastest = dict.fromkeys(envs, float("inf"))
@@ -51,8 +51,8 @@ def rates(envs: dict[float, Any], seconds_of: Callable[[Callable[[], object]], f
 
 def scaling() -> dict[str, dict[float, float]]:
     """Measure all four curves."""
-    from rcdsac_trl.world.env import make_env
-    from rcdsac_trl.world.maps import MapSettings
+    from rcdsac_trl.world.maps.generator import MapSettings
+    from rcdsac_trl.world.task.env import make_env
 
     agents: dict[float, Any] = {n: make_env(agent_ids=range(n), num_workers=0) for n in AGENTS}
     clutter = {density: make_env(MapSettings(clutter_per_m2=density), num_workers=0) for density in CLUTTER_PER_M2}
@@ -69,9 +69,9 @@ def replay_bytes(steps: int) -> int:
     import torch
     from tensordict import TensorDict
 
-    from rcdsac_trl.interface import sensor_mask
-    from rcdsac_trl.pipeline.replay import SequenceReplay
-    from rcdsac_trl.world.spaces import SPACES
+    from rcdsac_trl.robot.range_sensor import sensor_mask
+    from rcdsac_trl.storage.replay import SequenceReplay
+    from rcdsac_trl.world.task.spaces import SPACES
 
     episode_steps = 1000
     replay = SequenceReplay(

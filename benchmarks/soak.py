@@ -55,8 +55,8 @@ def main() -> None:
     parser.add_argument("overrides", nargs="*", help="of train's config, such as world.num_workers=2")
     options = parser.parse_args()
     bench.prepare()
-    from rcdsac_trl.pipeline import build
-    from rcdsac_trl.pipeline.cli import compose
+    from rcdsac_trl.config.compose import compose
+    from rcdsac_trl.training.setup import make_trainer
 
     given = [
         "+algo=rcdsac_pow",
@@ -72,7 +72,7 @@ def main() -> None:
     ]
     rows: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
-        trainer = build.trainer(compose("train", given), Path(folder) / "run")
+        trainer = make_trainer(compose("train", given), Path(folder) / "run")
         save, began = trainer.checkpoints.save, time.monotonic()
         last = began
 

@@ -51,13 +51,13 @@ def run(overrides: list[str]) -> dict[str, float]:
     Args:
         overrides: of train's config.
     """
-    from rcdsac_trl.pipeline import build
-    from rcdsac_trl.pipeline.cli import compose
+    from rcdsac_trl.config.compose import compose
+    from rcdsac_trl.training.setup import make_trainer
 
     started = time.perf_counter()
     # The run's own messages are not results.
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(sys.stderr):
-        trainer = build.trainer(compose("train", overrides), Path(folder) / "run")
+        trainer = make_trainer(compose("train", overrides), Path(folder) / "run")
         startup = time.perf_counter() - started
         timed = {
             "collection": (trainer.episodes, "collect"),

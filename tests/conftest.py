@@ -57,7 +57,7 @@ def tiny_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, str]]:
     """Run the jobs of sweeps and searches in this process, as the programs they are, and list them."""
-    from rcdsac_trl.pipeline import sweep
+    from rcdsac_trl.experiments import sweep
 
     made: list[tuple[str, str]] = []
     monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else they start this process again

@@ -17,11 +17,12 @@ from typing import Any
 
 import torch
 
-from rcdsac_trl.pipeline import build, drivers
-from rcdsac_trl.pipeline.learner import Learner
-from rcdsac_trl.pipeline.logs import RunLog
-from rcdsac_trl.pipeline.replay import SequenceReplay
-from rcdsac_trl.world.agents import AgentGroup
+from rcdsac_trl.rollout import evaluation_pool
+from rcdsac_trl.storage.replay import SequenceReplay
+from rcdsac_trl.training.learner import Learner
+from rcdsac_trl.training.run_log import RunLog
+from rcdsac_trl.training.setup import resume_training
+from rcdsac_trl.world.task.agent_group import AgentGroup
 from tiny import evaluate, tiny_trainer
 
 SAVING = [(os, "fsync"), (os, "rename"), (os, "truncate"), (os, "unlink"), (shutil, "rmtree")]
@@ -62,7 +63,7 @@ def work(job: dict[str, Any]) -> None:
     if job["do"] == "train":
         tiny_trainer(folder, job["row"], *job["overrides"]).run()
     else:
-        trainer = build.resumed(folder)
+        trainer = resume_training(folder)
         if trainer is not None:
             trainer.run()
     happened = dict(events.counted)
@@ -74,7 +75,7 @@ def work(job: dict[str, Any]) -> None:
 def main() -> None:
     """Do jobs until standard input ends; answer each with the status of its process."""
     torch.set_num_threads(1)
-    drivers.START_METHOD = "fork"  # a fork server would import everything for each job anew
+    evaluation_pool.START_METHOD = "fork"  # a fork server would import everything for each job anew
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what trainings print goes elsewhere
     with TemporaryDirectory() as folder:  # what is compiled and which maps are made, all forks then have

@@ -5,8 +5,9 @@ import sys
 import time
 from pathlib import Path
 
-from rcdsac_trl.pipeline import build
-from rcdsac_trl.pipeline.saved import CHECKPOINTS, folder_name
+from rcdsac_trl.config.run_config import CHECKPOINTS
+from rcdsac_trl.storage.checkpoint_record import folder_name
+from rcdsac_trl.training.setup import resume_training
 from tiny import TINY, tiny_trainer
 
 GIVEN = ["schedule.iterations=4", "task.episode_steps=200"]
@@ -29,7 +30,7 @@ def check_killed_run_is_continued(folder: Path, *collector: str) -> None:
     while any(map(is_alive, started)) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not any(map(is_alive, started))
-    resumed = build.resumed(run)
+    resumed = resume_training(run)
     assert resumed is not None
     assert resumed.progress.iterations >= 1
     resumed.run()

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rcdsac_trl.deploy.weights import AgentConfig, Weights
+from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights
 
 POW: dict[str, Any] = {
     "name": "rcdsac_pow",

@@ -80,7 +80,7 @@ def test_products_of_compiled_passes_are_counted() -> None:
 import numpy as np
 from learner import count_products
 counted = count_products()
-from rcdsac_trl.agent.products import times
+from rcdsac_trl.agent.kernels.matmul import times
 for size in (4, 8):
     out = np.zeros((3, 5), np.float32)
     times(np.ones((3, size), np.float32), np.ones((size, 5), np.float32), out, False)

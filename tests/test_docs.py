@@ -8,9 +8,11 @@ import pytest
 from omegaconf import OmegaConf
 
 from rcdsac_trl import draw_maps
-from rcdsac_trl.paths import CONF_DIR
-from rcdsac_trl.pipeline import build
-from rcdsac_trl.pipeline.cli import compose
+from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.experiments.make_search import make_search
+from rcdsac_trl.experiments.make_sweep import make_sweep
+from rcdsac_trl.training.setup import check_training
 from tiny import first_combinations_only
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,16 +42,16 @@ def commands() -> list[tuple[str, str]]:
 def test_commands_are_accepted(verb: str, arguments: str, monkeypatch: pytest.MonkeyPatch) -> None:
     overrides = shlex.split(arguments)
     if verb == "search":
-        build.search(overrides)
+        make_search(overrides)
         return
     if "-m" in overrides:  # of each named run its first combination stands for the others
         first_combinations_only(monkeypatch)
-        build.sweep([override for override in overrides if override != "-m"])
+        make_sweep([override for override in overrides if override != "-m"])
         return
     overrides = [override.replace(NEW_ROW, "rcdsac_pow") for override in overrides]
     cfg = compose(verb, overrides)
     if verb == "train":
-        build.check_training(cfg)
+        check_training(cfg)
     elif verb == "draw_maps":
         draw_maps.check(cfg)
 

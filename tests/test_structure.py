@@ -16,12 +16,13 @@ from torchrl.envs import EnvBase
 import rcdsac_trl
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.agent.risk import MEASURES
-from rcdsac_trl.interface import SENSORS
-from rcdsac_trl.paths import CONF_DIR
-from rcdsac_trl.pipeline.build.world import environment
-from rcdsac_trl.pipeline.settings import AlgoSettings, DistortionSettings, WorldSettings
-from rcdsac_trl.world.maps import MapSettings
-from rcdsac_trl.world.task import TaskSettings
+from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
+from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.robot.range_sensor import SENSORS
+from rcdsac_trl.rollout.environments import environment
+from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.task.rules import TaskSettings
+from rcdsac_trl.world.task.world_settings import WorldSettings
 
 SOURCE = Path(rcdsac_trl.__file__).parent
 
@@ -89,11 +90,7 @@ def test_reports_are_written_without_torch(module: str) -> None:
 @pytest.mark.parametrize("module", MODULES)
 def test_only_the_builders_read_the_config(module: str) -> None:
     config_libraries = {name.split(".")[0] for name in imported_modules(SOURCE / module)} & {"hydra", "omegaconf"}
-    may = (
-        is_entry_point(module)
-        or module.startswith("pipeline/build/")
-        or module in ("pipeline/cli.py", "pipeline/logs.py")
-    )
+    may = is_entry_point(module) or module.startswith("pipeline/build/") or module in ("cli.py", "training/run_log.py")
     assert may or not config_libraries
 
 

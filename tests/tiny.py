@@ -8,12 +8,13 @@ import pytest
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from rcdsac_trl.paths import CONF_DIR
-from rcdsac_trl.pipeline import build
-from rcdsac_trl.pipeline.build.read import training_settings
-from rcdsac_trl.pipeline.cli import combinations, compose
-from rcdsac_trl.pipeline.run_settings import TrainingSettings
-from rcdsac_trl.pipeline.trainer import Trainer
+from rcdsac_trl.config.compose import combinations, compose
+from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.training.setup import check_training, make_trainer
+from rcdsac_trl.training.trainer import Trainer
 
 ROWS = sorted(path.stem for path in (CONF_DIR / "algo").glob("*.yaml"))
 """Every row of the registry."""
@@ -66,14 +67,14 @@ def tiny_settings(row: str = "rcdsac_pow", *overrides: str) -> TrainingSettings:
 def tiny_trainer(folder: Path, row: str = "rcdsac_pow", *overrides: str) -> Trainer:
     """Make a tiny training, as the command line does."""
     cfg = tiny_cfg(row, *overrides)
-    build.check_training(cfg)
-    return build.trainer(cfg, folder)
+    check_training(cfg)
+    return make_trainer(cfg, folder)
 
 
 def evaluate(*overrides: str) -> Path:
     """Evaluate two episodes on one map, as the command line does; return where it wrote."""
     given = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1", *overrides]
-    evaluation = build.evaluation(compose("evaluate", given))
+    evaluation = make_evaluation(compose("evaluate", given))
     evaluation.run()
     return evaluation.results.path
 
@@ -100,6 +101,6 @@ def _composed_once(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
 
 def first_combinations_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the first combination of each run of a sweep stand for the others, composed once for all sweeps."""
-    module = import_module("rcdsac_trl.pipeline.build.sweep")
+    module = import_module("rcdsac_trl.experiments.make_sweep")
     monkeypatch.setattr(module, "combinations", lambda overrides: combinations(overrides)[:1])
     monkeypatch.setattr(module, "compose", lambda name, overrides: _composed_once(name, tuple(overrides)))

@@ -46,7 +46,7 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
 
     folder = Path(name_or_folder)
     if (folder / "checkpoints").is_dir():
-        from rcdsac_trl.pipeline.build.weights import weights_of_run
+        from rcdsac_trl.release.run_weights import weights_of_run
 
         return Policy(weights_of_run(folder, "best"), **options)
     return Policy(read_weights(find_weights(name_or_folder)), **options)
@@ -61,6 +61,6 @@ def register_gym() -> None:
         >>> env = gymnasium.make("RCDSACNavigation-v0", sensor="sparse")
     """
     # Imported late, so that importing the package stays instant.
-    from rcdsac_trl.world import gym
+    from rcdsac_trl.world.task import gymnasium_env
 
-    gym.register()
+    gymnasium_env.register()

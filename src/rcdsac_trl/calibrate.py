@@ -2,23 +2,23 @@
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.cli import entry_point
 
 
 def check(cfg: DictConfig) -> None:
     """Refuse what cannot work, before anything is written."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.evaluation.make_calibration import make_calibration
 
-    build.calibration(cfg)
+    make_calibration(cfg)
 
 
 @entry_point("calibrate", check=check)
 def main(cfg: DictConfig) -> None:
     """Roll out, write states and returns, then what they say and a picture of it."""
-    from rcdsac_trl.pipeline import build
-    from rcdsac_trl.report.calibration import write_calibration
+    from rcdsac_trl.evaluation.make_calibration import make_calibration
+    from rcdsac_trl.report.calibration_report import write_calibration
 
-    calibration = build.calibration(cfg)
+    calibration = make_calibration(cfg)
     calibration.run()
     print(write_calibration(calibration.results.path))
     print(f"written to {calibration.results.path}")

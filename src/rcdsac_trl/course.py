@@ -2,23 +2,23 @@
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.cli import entry_point
 
 
 def check(cfg: DictConfig) -> None:
     """Refuse what cannot work, before anything is written."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.evaluation.course.make_course import make_course
 
-    build.course(cfg)
+    make_course(cfg)
 
 
 @entry_point("course", check=check)
 def main(cfg: DictConfig) -> None:
     """Drive forward and in reverse, write the runs, then the paper's second table and a picture of them."""
-    from rcdsac_trl.pipeline import build
-    from rcdsac_trl.report.course import write_course
+    from rcdsac_trl.evaluation.course.make_course import make_course
+    from rcdsac_trl.report.course_table import write_course
 
-    course = build.course(cfg)
+    course = make_course(cfg)
     course.run()
     print(write_course(course.results.path))
     print(f"written to {course.results.path}")

@@ -15,14 +15,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 from omegaconf import DictConfig, OmegaConf
 
+from rcdsac_trl.cli import entry_point
+from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline.cli import entry_point
-from rcdsac_trl.pipeline.resources import check_picture
-from rcdsac_trl.pipeline.typed import read
 from rcdsac_trl.seeding import stream
-from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
-from rcdsac_trl.world.maps import SPLITS, Map, MapSettings, Split, generate_map
-from rcdsac_trl.world.planner import Planner
+from rcdsac_trl.system.resources import check_picture
+from rcdsac_trl.world.maps.generator import SPLITS, Map, MapSettings, Split, generate_map
+from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
+from rcdsac_trl.world.maps.planner import Planner
 
 _FLOOR = "#f7f5f0"
 _WALL = "#3d4450"

@@ -2,22 +2,22 @@
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.cli import entry_point
 
 
 def check(cfg: DictConfig) -> None:
     """Refuse what cannot work, before anything is written."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.evaluation.make_evaluation import make_evaluation
 
-    build.evaluation(cfg)
+    make_evaluation(cfg)
 
 
 @entry_point("evaluate", check=check)
 def main(cfg: DictConfig) -> None:
     """Drive the episodes, write one row each and a summary."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.evaluation.make_evaluation import make_evaluation
 
-    build.evaluation(cfg).run()
+    make_evaluation(cfg).run()
 
 
 if __name__ == "__main__":

@@ -2,22 +2,22 @@
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.cli import entry_point
 
 
 def check(cfg: DictConfig) -> None:
     """Refuse what cannot work, before anything is written."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.release.agent_export import make_export
 
-    build.export(cfg)
+    make_export(cfg)
 
 
 @entry_point("export", check=check)
 def main(cfg: DictConfig) -> None:
     """Write weights, ONNX and torch programs, once they are seen to agree."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.release.agent_export import make_export
 
-    export = build.export(cfg)
+    export = make_export(cfg)
     export.run()
     print(f"wrote {export.out}")
 

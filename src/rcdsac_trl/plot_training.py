@@ -20,12 +20,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from rcdsac_trl.cli import entry_point
+from rcdsac_trl.config.run_config import CONFIG_NAME
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline.cli import entry_point
-from rcdsac_trl.pipeline.logs import CONFIG_NAME, TRAINING_TABLE
-from rcdsac_trl.pipeline.metrics import validation_score
-from rcdsac_trl.pipeline.resources import check_picture
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, shades, style
+from rcdsac_trl.rollout.metrics import validation_score
+from rcdsac_trl.system.resources import check_picture
+from rcdsac_trl.training.run_log import TRAINING_TABLE
 
 PANELS: Mapping[str, str] = {
     "reward": "reward per episode",
@@ -34,7 +35,7 @@ PANELS: Mapping[str, str] = {
     "mean_speed_m_per_s": "mean speed, m/s",
     "contact_fraction": "steps in contact",
 }
-"""The metrics of :mod:`rcdsac_trl.pipeline.metrics` in the order of the panels, and what stands above each."""
+"""The metrics of :mod:`rcdsac_trl.rollout.metrics` in the order of the panels, and what stands above each."""
 
 _CONDITIONS = ("beta", "collision_weight")
 _SYMBOLS = {"beta": "β", "collision_weight": "w_coll"}

@@ -2,23 +2,23 @@
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.cli import entry_point
 
 
 def check(cfg: DictConfig) -> None:
     """Refuse what cannot work, before anything is written."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.release.make_publication import make_publication
 
-    build.publication(cfg)
+    make_publication(cfg)
 
 
 @entry_point("publish", check=check)
 def main(cfg: DictConfig) -> None:
     """Write each agent's weights, card and tables."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.release.make_publication import make_publication
     from rcdsac_trl.report.card import driving_section
 
-    for line in build.publication(cfg).run(driving_section):
+    for line in make_publication(cfg).run(driving_section):
         print(line)
 
 

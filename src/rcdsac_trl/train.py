@@ -5,38 +5,40 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.pipeline.cli import entry_point
+from rcdsac_trl.cli import entry_point
 
 if TYPE_CHECKING:
-    from rcdsac_trl.pipeline.trainer import Trainer
+    from rcdsac_trl.training.trainer import Trainer
 
 
 def check(cfg: DictConfig) -> None:
     """Refuse what cannot work, before anything is written."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.training.setup import check_training
 
-    build.check_training(cfg)
+    check_training(cfg)
 
 
 def check_folder(folder: Path) -> None:
     """Refuse a folder that already holds a run, before Hydra makes it."""
-    from rcdsac_trl.pipeline import logs
+    from rcdsac_trl.training import run_log
 
-    logs.check_folder(folder)
+    run_log.check_folder(folder)
 
 
 def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
     """Run a sweep, or continue a run, if the call asks for that; return whether it did. Hydra has no part in either."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.experiments.make_sweep import check_single, make_sweep
+    from rcdsac_trl.training.resume import run_to_continue
+    from rcdsac_trl.training.setup import resume_training
 
     if multirun:
-        build.sweep(overrides).run()
+        make_sweep(overrides).run()
         return True
-    build.check_single(overrides)
-    folder = build.run_to_continue(overrides)
+    check_single(overrides)
+    folder = run_to_continue(overrides)
     if folder is None:
         return False
-    trainer = build.resumed(folder)
+    trainer = resume_training(folder)
     if trainer is None:
         print(f"{folder} is finished: nothing is left to do")
     else:
@@ -47,13 +49,13 @@ def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
 @entry_point("train", check=check, check_folder=check_folder, instead=sweep_or_continue)
 def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
-    from rcdsac_trl.pipeline import build
+    from rcdsac_trl.training.setup import given_overrides, make_trainer, run_folder
 
-    _run(build.trainer(cfg, build.run_folder(), build.given_overrides()))
+    _run(make_trainer(cfg, run_folder(), given_overrides()))
 
 
 def _run(trainer: "Trainer") -> None:
-    from rcdsac_trl.pipeline.interrupts import at_safe_points
+    from rcdsac_trl.system.interrupts import at_safe_points
 
     with at_safe_points():
         trainer.run()

@@ -29,9 +29,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rcdsac_trl.agent.observation_features import observation_features
-from rcdsac_trl.agent.quantile_values import HeadLayers, quantile_values
-from rcdsac_trl.agent.recurrent_kernels import gated_recurrence
+from rcdsac_trl.agent.kernels.observation_features import observation_features
+from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
+from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 

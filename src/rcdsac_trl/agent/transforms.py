@@ -36,7 +36,7 @@ class EpisodeSampler(Transform):
 
     Example:
         >>> from torchrl.envs import TransformedEnv
-        >>> from rcdsac_trl.world.env import make_env
+        >>> from rcdsac_trl.world.task.env import make_env
         >>> sampler = EpisodeSampler("risk", lambda u: -2.0 * u, seed=0, agent_ids=range(2))
         >>> TransformedEnv(make_env(num_workers=0, agent_ids=range(2)), sampler).reset()["risk"].shape
         torch.Size([2, 1])

@@ -1,18 +1,24 @@
 """A trained agent on a robot: reading it, driving with it, and what sensors say in the form it knows.
 
-Nothing here needs PyBullet, Hydra, TorchRL or torch, but for :mod:`rcdsac_trl.deploy.exported`, which writes ONNX.
+Nothing here needs PyBullet, Hydra, TorchRL or torch, but for :mod:`rcdsac_trl.deploy.export`, which writes ONNX.
 """
 
-from rcdsac_trl.deploy.adaptive import BanditBeta, BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
-from rcdsac_trl.deploy.checks import InputLimits, Stamps
-from rcdsac_trl.deploy.cloud import CameraPose, CloudFilter, cloud_sectors
-from rcdsac_trl.deploy.command import Command, Outlook
-from rcdsac_trl.deploy.guard import Guard
-from rcdsac_trl.deploy.path import PathFollower
-from rcdsac_trl.deploy.policy import Policy
-from rcdsac_trl.deploy.scan import Scan, scan_sectors
-from rcdsac_trl.deploy.sectors import Mount, Sectors
-from rcdsac_trl.deploy.weights import AgentConfig, Weights, find_weights, read_weights, shipped_names
+from rcdsac_trl.deploy.policy.beta_controllers import (
+    BanditBeta,
+    BetaController,
+    ClearanceBeta,
+    FixedBeta,
+    TailVarianceBeta,
+)
+from rcdsac_trl.deploy.policy.checks import InputLimits, Stamps
+from rcdsac_trl.deploy.policy.command import Command, Outlook
+from rcdsac_trl.deploy.policy.guard import Guard
+from rcdsac_trl.deploy.policy.path import PathFollower
+from rcdsac_trl.deploy.policy.policy import Policy
+from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights, find_weights, read_weights, shipped_names
+from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
+from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors
+from rcdsac_trl.deploy.sensors.sectors import Mount, Sectors
 
 __all__ = [
     "AgentConfig",

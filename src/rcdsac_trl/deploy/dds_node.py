@@ -16,12 +16,12 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 import rcdsac_trl
-from rcdsac_trl.deploy.driver import Driver
-from rcdsac_trl.deploy.sectors import Mount
+from rcdsac_trl.deploy.policy.driver import Driver
+from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
 
 if TYPE_CHECKING:
-    from rcdsac_trl.deploy.dds_bridge import DdsBridge
+    from rcdsac_trl.deploy.ros.dds_bridge import DdsBridge
 
 _LARGEST_DOMAIN = 232  # the ports of larger ones are beyond the last
 
@@ -49,7 +49,7 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
     """
     if importlib.util.find_spec("cyclonedds") is None:
         raise UserInputError("DDS needs cyclonedds, which is not installed: pip install 'rcdsac-trl[dds]'")
-    from rcdsac_trl.deploy.dds_bridge import DdsBridge
+    from rcdsac_trl.deploy.ros.dds_bridge import DdsBridge
 
     domain_id = _domain_id(os.environ.get("ROS_DOMAIN_ID") or "0")
     remapped = dict(_renaming(text) for text in args.remap)

@@ -1,4 +1,4 @@
-"""A ROS 2 node around :class:`~rcdsac_trl.deploy.driver.Driver`; the one file that needs ``rclpy``.
+"""A ROS 2 node around :class:`~rcdsac_trl.deploy.policy.driver.Driver`; the one file that needs ``rclpy``.
 
 Run it where ROS 2 is sourced: ``python -m rcdsac_trl.deploy.ros_node --ros-args -p agent:=<name or folder>``.
 It reads ``scan``, ``odom`` and ``plan``, writes ``cmd_vel`` (``geometry_msgs/TwistStamped``) and the return's quantiles
@@ -20,9 +20,9 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Float32MultiArray
 
 import rcdsac_trl
-from rcdsac_trl.deploy.driver import Driver
-from rcdsac_trl.deploy.messages import twist_stamped
-from rcdsac_trl.deploy.sectors import Mount
+from rcdsac_trl.deploy.policy.driver import Driver
+from rcdsac_trl.deploy.ros.messages import twist_stamped
+from rcdsac_trl.deploy.sensors.sectors import Mount
 
 
 class PolicyNode(Node):

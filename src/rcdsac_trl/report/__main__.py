@@ -4,10 +4,10 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from rcdsac_trl.cli import entry_point
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.pipeline.cli import entry_point
-from rcdsac_trl.pipeline.resources import check_writable
 from rcdsac_trl.report.read import Episodes, read_episodes
+from rcdsac_trl.system.resources import check_writable
 
 
 def _read(cfg: DictConfig) -> tuple[Episodes, list[Path], Path]:

@@ -13,9 +13,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.interface import MAX_RANGE_M
-from rcdsac_trl.world.geometry import ROBOT_RADIUS_M
-from rcdsac_trl.world.shapes import Map
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M
+from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
+from rcdsac_trl.world.maps.shapes import Map
 
 Color = tuple[int, ...]
 
@@ -74,7 +74,7 @@ class Renderer:
         oversampling: how many times finer than the frame everything is drawn.
 
     Example:
-        >>> from rcdsac_trl.world.env import NavigationEnv
+        >>> from rcdsac_trl.world.task.env import NavigationEnv
         >>> env = NavigationEnv(agent_ids=(0,))
         >>> _ = env.reset()
         >>> Renderer(size_px=256).draw(env.agents.scene(0)).shape

@@ -1,0 +1,264 @@
+"""The compiled passes of :mod:`rcdsac_trl.agent.kernels.quantile_values`, on arrays.
+
+Rows go through all layers, matrix products included, in blocks that stay in the cache. Shapes: B sequences of L steps
+have N fractions each; H features, C cosines. What is constant along a sequence has one step.
+"""
+
+import numba
+import numpy as np
+
+from rcdsac_trl.agent.kernels.feature_kernels import linear
+from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+
+#: Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
+ROWS_PER_BLOCK = 1024
+
+# A sum over features may be added up in any order, which lets several be added at once. A loop has few arrays: of many
+# the compiler gives up showing that they are apart.
+_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
+
+
+@_compiled
+def _multiply(x: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, product: np.ndarray) -> None:
+    """Write ``x * relu(tau_gate + beta)``, broadcast over steps and quantiles."""
+    zero = x.dtype.type(0)
+    for s in range(x.shape[0]):
+        for t in range(x.shape[1]):
+            features, offset = x[s, t], beta[s, min(t, beta.shape[1] - 1)]
+            gates = tau_gate[s, min(t, tau_gate.shape[1] - 1)]
+            for n in range(gates.shape[0]):
+                gate, out = gates[n], product[s, t, n]
+                for h in range(out.size):
+                    out[h] = features[h] * max(gate[h] + offset[h], zero)
+
+
+@_compiled
+def _output(hidden: np.ndarray, bias: np.ndarray, weight: np.ndarray, out_bias: np.ndarray, values: np.ndarray) -> None:
+    """Add the bias to hidden and rectify it, in place, and write its product with the output layer."""
+    zero = hidden.dtype.type(0)
+    for r in range(hidden.shape[0]):
+        row, total = hidden[r], out_bias[0]
+        for h in range(row.size):
+            row[h] = max(row[h] + bias[h], zero)
+            total += row[h] * weight[h]
+        values[r] = total
+
+
+@_compiled
+def _output_gradient(
+    slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray, d_bias: np.ndarray, d_weight: np.ndarray
+) -> None:
+    """Write the output's gradient where hidden is active, and add those of hidden's bias and of the output's weight."""
+    zero = hidden.dtype.type(0)
+    for r in range(hidden.shape[0]):
+        row, d_row, slope = hidden[r], d_hidden[r], slopes[r]
+        for h in range(row.size):
+            d_row[h] = slope if row[h] > zero else zero
+        for h in range(row.size):
+            d_bias[h] += d_row[h]
+            d_weight[h] += slope * row[h]
+
+
+@_compiled
+def _sloping_gradient(slopes: np.ndarray, hidden: np.ndarray, d_hidden: np.ndarray) -> int:
+    """Write the output's gradient where hidden is active, of transitions that have one, and return their number."""
+    zero, number = hidden.dtype.type(0), 0
+    for s in range(slopes.shape[0]):
+        for t in range(slopes.shape[1]):
+            if slopes[s, t].any():
+                for n in range(slopes.shape[2]):
+                    row, d_row, slope = hidden[s, t, n], d_hidden[number, n], slopes[s, t, n]
+                    for h in range(row.size):
+                        d_row[h] = slope if row[h] > zero else zero
+                number += 1
+    return number
+
+
+@_compiled
+def _features_gradient(
+    slopes: np.ndarray, d_product: np.ndarray, tau_gate: np.ndarray, beta: np.ndarray, d_x: np.ndarray
+) -> None:
+    """Add the gradient of x: the product's, of transitions that have one, times the gate."""
+    zero, number = d_x.dtype.type(0), 0
+    for s in range(d_x.shape[0]):
+        for t in range(d_x.shape[1]):
+            if slopes[s, t].any():
+                d_features, offset = d_x[s, t], beta[s, min(t, beta.shape[1] - 1)]
+                gates = tau_gate[s, min(t, tau_gate.shape[1] - 1)]
+                for n in range(gates.shape[0]):
+                    gate, d_out = gates[n], d_product[number, n]
+                    for h in range(d_out.size):
+                        d_features[h] += d_out[h] * max(gate[h] + offset[h], zero)
+                number += 1
+
+
+@_compiled
+def _product_gradient(
+    product: np.ndarray,
+    x: np.ndarray,
+    tau_gate: np.ndarray,
+    beta: np.ndarray,
+    d_x: np.ndarray,
+    d_tau_gate: np.ndarray,
+    d_beta: np.ndarray,
+) -> None:
+    """Add the gradients of x and of both halves of the gate; turn the product's gradient into the product."""
+    zero = x.dtype.type(0)
+    for s in range(x.shape[0]):
+        for t in range(x.shape[1]):
+            at_beta, at_tau = min(t, beta.shape[1] - 1), min(t, tau_gate.shape[1] - 1)
+            features, d_features, offset, d_offset = x[s, t], d_x[s, t], beta[s, at_beta], d_beta[s, at_beta]
+            for n in range(tau_gate.shape[2]):
+                gate, d_gate, out = tau_gate[s, at_tau, n], d_tau_gate[s, at_tau, n], product[s, t, n]
+                for h in range(out.size):
+                    opened = max(gate[h] + offset[h], zero)
+                    change = out[h] * features[h] if opened > zero else zero
+                    d_features[h] += out[h] * opened
+                    d_gate[h] += change
+                    d_offset[h] += change
+                    out[h] = features[h] * opened
+
+
+@_compiled
+def input_layer(joined: np.ndarray, weight: np.ndarray, bias: np.ndarray, x: np.ndarray) -> None:
+    """Write the features ``[B, L, H]`` of memory and action side by side."""
+    linear(_rows(joined), weight, bias, 0, _rows(x))
+
+
+@_compiled
+def input_gradient(x: np.ndarray, weight: np.ndarray, d_x: np.ndarray, d_joined: np.ndarray) -> None:
+    """Turn the gradient of the features into that before their rectifier, and write that of memory and action."""
+    rows, d_rows, zero = _rows(x), _rows(d_x), x.dtype.type(0)
+    for r in range(rows.shape[0]):
+        row, d_row = rows[r], d_rows[r]
+        for h in range(row.size):
+            d_row[h] = d_row[h] if row[h] > zero else zero
+    times(d_rows, weight, _rows(d_joined), False)
+
+
+@_compiled
+def affine_gradient(d_out: np.ndarray, given: np.ndarray, d_weight: np.ndarray, d_bias: np.ndarray) -> None:
+    """Write the gradients of a linear layer's weight and bias."""
+    d_rows = _rows(d_out)
+    transposed_times(d_rows, _rows(given), d_weight, False)
+    add_up(d_rows, d_bias)
+
+
+@_compiled
+def add_up(rows: np.ndarray, total: np.ndarray) -> None:
+    """Write the sum of the rows."""
+    total[:] = 0
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        for h in range(row.size):
+            total[h] += row[h]
+
+
+@_compiled
+def offsets(cosines: np.ndarray, weight: np.ndarray, bias: np.ndarray, beta: np.ndarray) -> None:
+    """Write beta's part of the gates, bias included, ``[B, L, H]``."""
+    rows = _rows(beta)
+    for r in range(rows.shape[0]):
+        rows[r] = bias
+    times_transposed(_rows(cosines), weight, rows, True)
+
+
+@_compiled
+def layers(
+    x: np.ndarray,
+    cosines: np.ndarray,
+    beta: np.ndarray,
+    gate_weight: np.ndarray,
+    weight: np.ndarray,
+    bias: np.ndarray,
+    out_weight: np.ndarray,
+    out_bias: np.ndarray,
+    tau_gate: np.ndarray,
+    hidden: np.ndarray,
+    values: np.ndarray,
+) -> None:
+    """Write the gates, the hidden layer and the values; hidden may have room for some sequences alone."""
+    sequences, steps, number = values.shape
+    times_transposed(_rows(cosines), gate_weight, _rows(tau_gate), False)
+    size = block(steps * number, sequences)
+    product = room((size, steps, number, x.shape[2]), x)
+    for start in range(0, sequences, size):
+        stop = min(start + size, sequences)
+        first = start if hidden.shape[0] >= sequences else 0
+        inner, factors = _rows(hidden[first : first + stop - start]), product[: stop - start]
+        _multiply(x[start:stop], tau_gate[start:stop], beta[start:stop], factors)
+        times_transposed(_rows(factors), weight, inner, False)
+        _output(inner, bias, out_weight, out_bias, values[start:stop].reshape(-1))
+
+
+@_compiled
+def layers_gradient(
+    slopes: np.ndarray,
+    x: np.ndarray,
+    cosines: np.ndarray,
+    beta: np.ndarray,
+    tau_gate: np.ndarray,
+    hidden: np.ndarray,
+    through: np.ndarray,
+    d_x: np.ndarray,
+    d_beta: np.ndarray,
+    d_gate_weight: np.ndarray,
+    d_weight: np.ndarray,
+    d_bias: np.ndarray,
+    d_out_weight: np.ndarray,
+) -> None:
+    """Add the gradients of all layers; those of weight and bias lack the output's weight, a factor of each row."""
+    sequences, steps, number = slopes.shape
+    size = block(steps * number, sequences)
+    product, d_hidden = room((size, steps, number, x.shape[2]), x), room((size, *hidden.shape[1:]), x)
+    d_tau_gate = room(tau_gate.shape, x)
+    d_tau_gate[:] = 0
+    for start in range(0, sequences, size):
+        stop = min(start + size, sequences)
+        factors, d_inner = product[: stop - start], _rows(d_hidden[: stop - start])
+        _output_gradient(slopes[start:stop].reshape(-1), _rows(hidden[start:stop]), d_inner, d_bias, d_out_weight)
+        times(d_inner, through, _rows(factors), False)
+        _product_gradient(
+            factors,
+            x[start:stop],
+            tau_gate[start:stop],
+            beta[start:stop],
+            d_x[start:stop],
+            d_tau_gate[start:stop],
+            d_beta[start:stop],
+        )
+        transposed_times(d_inner, _rows(factors), d_weight, True)
+    transposed_times(_rows(d_tau_gate), _rows(cosines), d_gate_weight, True)
+
+
+@_compiled
+def gradient_of_features(
+    slopes: np.ndarray,
+    beta: np.ndarray,
+    tau_gate: np.ndarray,
+    hidden: np.ndarray,
+    through: np.ndarray,
+    d_x: np.ndarray,
+) -> None:
+    """Add the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
+    sequences, steps, number = slopes.shape
+    size = block(steps * number, sequences)
+    d_hidden = room((size * steps, number, hidden.shape[3]), d_x)
+    d_product = room((size * steps, number, d_x.shape[2]), d_x)
+    for start in range(0, sequences, size):
+        stop = min(start + size, sequences)
+        sloping = _sloping_gradient(slopes[start:stop], hidden[start:stop], d_hidden)
+        times(_rows(d_hidden[:sloping]), through, _rows(d_product[:sloping]), False)
+        _features_gradient(slopes[start:stop], d_product, tau_gate[start:stop], beta[start:stop], d_x[start:stop])
+
+
+@_compiled
+def block(rows: int, sequences: int) -> int:
+    """Return how many sequences of so many rows each go through the layers together."""
+    return min(sequences, max(1, ROWS_PER_BLOCK // rows))
+
+
+@_compiled
+def _rows(array: np.ndarray) -> np.ndarray:
+    """Return all but the last dimension as one."""
+    return array.reshape(array.size // array.shape[-1], array.shape[-1])  # -1 cannot be inferred of no rows

@@ -1,0 +1,155 @@
+"""What a run may choose, checked: each class mirrors one section of ``conf/train.yaml``, which explains it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rcdsac_trl.agent.risk import RiskMeasure, make_measure
+from rcdsac_trl.config.conditions import Condition, check_unique
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system.checks import one_of
+
+Critic = Literal["quantile", "scalar"]
+Conditioning = Literal["per_episode", "fixed", "none"]
+Relabel = Literal["resample", "stored"]
+
+
+@dataclass(frozen=True)
+class DistortionSettings:
+    """A risk measure and the values of beta that are looked at (``conf/algo/distortion``)."""
+
+    name: str
+    low: float
+    high: float
+    evaluation_betas: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check every beta against the measure's domain."""
+        object.__setattr__(self, "evaluation_betas", tuple(float(beta) for beta in self.evaluation_betas))
+        measure = self.measure
+        for beta in self.evaluation_betas:
+            measure.check(beta)
+
+    @property
+    def measure(self) -> RiskMeasure:
+        """The measure, with its training range."""
+        return make_measure(self.name, self.low, self.high)
+
+
+@dataclass(frozen=True)
+class AlgoSettings:
+    """A row of the paper's table as a choice of parts (``conf/algo``)."""
+
+    name: str
+    critic: Critic
+    conditioning: Conditioning
+    relabel: Relabel
+    beta: float | None
+    collision_weight: tuple[float, float] | None
+    evaluation_collision_weights: tuple[float, ...]
+    distortion: DistortionSettings
+
+    def __post_init__(self) -> None:
+        """Refuse parts that do not fit together."""
+        one_of("algo.critic", self.critic, Critic)
+        one_of("algo.conditioning", self.conditioning, Conditioning)
+        one_of("algo.relabel", self.relabel, Relabel)
+        neutral = self.distortion.name == "neutral"
+        if (self.conditioning == "none") != neutral:
+            raise UserInputError(
+                f"algo.conditioning={self.conditioning} does not go with algo/distortion={self.distortion.name}: "
+                "none goes with neutral, per_episode and fixed with every other measure"
+            )
+        if self.critic == "scalar" and not neutral:
+            raise UserInputError(
+                f"algo.critic=scalar knows only the mean, so algo/distortion={self.distortion.name} does nothing: "
+                "use algo/distortion=neutral algo.conditioning=none, or algo.critic=quantile"
+            )
+        if (self.beta is not None) != (self.conditioning == "fixed"):
+            raise UserInputError(
+                f"algo.beta={self.beta} does not go with algo.conditioning={self.conditioning}: "
+                "fixed needs one beta, per_episode and none take null"
+            )
+        if self.beta is not None:
+            self.distortion.measure.check(self.beta)
+        if self.relabel == "resample" and self.conditioning != "per_episode":
+            raise UserInputError(
+                f"algo.relabel=resample does nothing with algo.conditioning={self.conditioning}: use stored"
+            )
+        if self.collision_weight is not None:
+            low, high = self.collision_weight
+            if not 0 <= low <= high:
+                raise UserInputError(
+                    f"algo.collision_weight=[{low},{high}] is no range: give [low,high] with 0 <= low <= high"
+                )
+            object.__setattr__(self, "collision_weight", (float(low), float(high)))
+        weights = tuple(float(weight) for weight in self.evaluation_collision_weights)
+        object.__setattr__(self, "evaluation_collision_weights", weights)
+        if bool(weights) != (self.collision_weight is not None):
+            raise UserInputError(
+                f"algo.evaluation_collision_weights={list(weights)} does not go with "
+                f"algo.collision_weight={self.collision_weight}: give both or neither"
+            )
+        if weights and self.conditioning == "per_episode":
+            raise UserInputError(
+                "algo.collision_weight does not go with algo.conditioning=per_episode: an episode tells the networks "
+                "either a weight or a beta"
+            )
+        for weight in weights:
+            self._check_weight(weight)
+        check_unique(self.default_conditions)
+
+    def _check_weight(self, weight: float) -> None:
+        low, high = self.collision_weight or (1.0, 1.0)
+        if not low <= weight <= high:
+            raise UserInputError(
+                f"collision weight {weight:g} is outside {self.name}'s range [{low:g}, {high:g}]: choose one inside"
+            )
+
+    @property
+    def network_measure(self) -> RiskMeasure | None:
+        """The measure whose beta the networks read; None where they read none."""
+        return self.distortion.measure if self.conditioning == "per_episode" else None
+
+    @property
+    def context_key(self) -> str | None:
+        """What is drawn for an episode and told to the networks."""
+        if self.conditioning == "per_episode":
+            return "risk"
+        return "collision_weight" if self.collision_weight is not None else None
+
+    @property
+    def default_conditions(self) -> list[Condition]:
+        """Where validation looks, and the paper's table."""
+        if self.conditioning == "per_episode":
+            return [Condition(beta=beta) for beta in self.distortion.evaluation_betas]
+        if self.collision_weight is not None:
+            return [Condition(collision_weight=weight) for weight in self.evaluation_collision_weights]
+        return [Condition(beta=self.beta)]
+
+    def conditions(self, betas: Sequence[float] | None, weights: Sequence[float] | None) -> list[Condition]:
+        """Turn what a user asks of an evaluation into conditions.
+
+        Raises:
+            UserInputError: if a beta is missing, or a beta or a weight is superfluous or outside its domain.
+        """
+        if weights is not None and self.collision_weight is None:
+            raise UserInputError(f"{self.name} has no collision weight: leave collision_weight out")
+        if self.conditioning == "per_episode":
+            if not betas:
+                shown = ",".join(f"{beta:g}" for beta in self.distortion.evaluation_betas)
+                raise UserInputError(f"{self.name} drives as its beta says: give one, such as beta=[{shown}]")
+            for beta in betas:
+                self.distortion.measure.check(beta)
+            asked = [Condition(beta=float(beta)) for beta in betas]
+        elif betas is not None and [float(beta) for beta in betas] != [self.beta]:
+            told = f"was trained for beta={self.beta:g} alone" if self.beta is not None else "has no beta"
+            raise UserInputError(f"{self.name} {told}: leave beta={list(betas)} out")
+        elif weights is not None:
+            for weight in weights:
+                self._check_weight(weight)
+            asked = [Condition(collision_weight=float(weight)) for weight in weights]
+        else:
+            asked = self.default_conditions
+        check_unique(asked)
+        return asked

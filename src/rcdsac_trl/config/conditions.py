@@ -1,0 +1,40 @@
+"""What an agent is told for a whole episode of an evaluation."""
+
+from dataclasses import dataclass
+
+from rcdsac_trl.errors import UserInputError
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What an agent is told for a whole episode: beta, a collision weight, or nothing; or what turns its beta."""
+
+    beta: float | None = None
+    collision_weight: float | None = None
+    controller: str | None = None
+
+    def __str__(self) -> str:
+        """Name the condition in logs and tables."""
+        if self.controller is not None:
+            return self.controller
+        if self.beta is not None:
+            return f"beta={self.beta:g}"
+        if self.collision_weight is not None:
+            return f"w_coll={self.collision_weight:g}"
+        return "all"
+
+    @property
+    def heading(self) -> str:
+        """Name the condition in pictures; empty where the agent is told nothing."""
+        if self.controller is not None:
+            return self.controller.replace("_", " ")
+        if self.beta is not None:
+            return f"β = {self.beta:g}"
+        return "" if self.collision_weight is None else f"w_coll = {self.collision_weight:g}"
+
+
+def check_unique(conditions: list[Condition]) -> None:
+    """Refuse to measure the same thing twice, which would shrink the apparent spread."""
+    for condition in conditions:
+        if conditions.count(condition) > 1:
+            raise UserInputError(f"{condition} is given more than once: name every value once")

@@ -1,0 +1,173 @@
+"""What an evaluation, a calibration, an export or a publication may choose: the roots of their files in ``conf/``."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rcdsac_trl.config.training_settings import SensorSettings, Threads, Workers
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system import runtime
+from rcdsac_trl.system.checks import check_least
+from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.task.rules import TaskSettings
+
+Name = Literal["best", "last"] | int
+"""How users name a checkpoint; a number: by the iterations that were done."""
+
+
+_MOST_FPS = 120
+
+
+@dataclass(frozen=True)
+class ControllerSettings:
+    """How controllers turn beta (``controller`` in ``conf/evaluate.yaml``), see ``deploy.policy.beta_controllers``."""
+
+    near_m: float
+    far_m: float
+    window_steps: int
+    step_size: float
+    exploration: float
+
+    def __post_init__(self) -> None:
+        """Refuse what the controllers would."""
+        if not 0.0 < self.near_m < self.far_m:
+            raise UserInputError(
+                f"controller.near_m={self.near_m:g} must be above 0 and below controller.far_m={self.far_m:g}"
+            )
+        if self.window_steps < 2:
+            raise UserInputError(f"controller.window_steps={self.window_steps} must be at least 2")
+        if self.step_size <= 0:
+            raise UserInputError(f"controller.step_size={self.step_size:g} must be above 0")
+        if not 0.0 <= self.exploration <= 1.0:
+            raise UserInputError(f"controller.exploration={self.exploration:g} must be from 0 to 1")
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """What an evaluation films (``video`` in ``conf/evaluate.yaml``)."""
+
+    map: int
+    episode: int
+    fps: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit."""
+        for key in ("map", "episode"):
+            if (number := getattr(self, key)) < 0:
+                raise UserInputError(f"video.{key}={number} must be at least 0")
+        if not 0 < self.fps <= _MOST_FPS:
+            raise UserInputError(
+                f"video.fps={self.fps:g} must be above 0 and at most {_MOST_FPS}: choose such a number"
+            )
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """The root of ``conf/export.yaml``."""
+
+    run: str | None
+    checkpoint: Name
+    out: str | None
+    num_quantiles: int
+
+    def __post_init__(self) -> None:
+        """Refuse an export of nothing."""
+        if self.run is None:
+            raise UserInputError("name what to export: run=<folder>")
+        check_least("num_quantiles", self.num_quantiles, 1)
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """The root of ``conf/evaluate.yaml``."""
+
+    run: str | None
+    beta: tuple[float, ...] | None
+    collision_weight: tuple[float, ...] | None
+    beta_controller: tuple[Literal["clearance", "tail_variance", "bandit"], ...] | None
+    controller: ControllerSettings
+    checkpoint: Name
+    baseline: Literal["pursuit"] | None
+    split: Literal["evaluation", "validation"]
+    seed: int
+    num_maps: int
+    num_episodes: int
+    sampled: bool
+    out: str | None
+    num_workers: Workers
+    gui: bool
+    record: bool
+    video: VideoSettings
+    device: str
+    threads: Threads
+    map: MapSettings | None = None
+    sensor: SensorSettings | None = None
+    task: TaskSettings | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit, and neither or both of run and baseline."""
+        if (self.run is None) == (self.baseline is None):
+            raise UserInputError("name what to evaluate: either run=<folder> or baseline=pursuit")
+        if self.out == "":
+            raise UserInputError("out names no folder: give it one, or leave it out")
+        if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
+            raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
+        asked = self.beta_controller or ()
+        if asked and len(self.beta or ()) < 2:
+            raise UserInputError(
+                f"beta_controller=[{','.join(asked)}] turns beta between the values of beta: give two or more of them"
+            )
+        for name in asked:
+            if asked.count(name) > 1:
+                raise UserInputError(f"beta_controller={name} is given more than once: name every one once")
+        check_least("seed", self.seed, 0)
+        check_least("num_maps", self.num_maps, 1)
+        check_least("num_episodes", self.num_episodes, 1)
+        for key, number in (("map", self.num_maps), ("episode", self.num_episodes)):
+            if self.record and (filmed := getattr(self.video, key)) >= number:
+                raise UserInputError(
+                    f"video.{key}={filmed} is not among the {number} evaluated: lower it, or raise num_{key}s"
+                )
+        resolve_processes(self.num_workers, self.num_maps)
+        runtime.resolve_threads(self.threads)
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """The root of ``conf/calibrate.yaml``."""
+
+    run: str | None
+    beta: tuple[float, ...] | None
+    checkpoint: Name
+    split: Literal["evaluation", "validation"]
+    seed: int
+    num_maps: int
+    num_states: int
+    num_rollouts: int
+    horizon_steps: int
+    out: str | None
+    num_workers: Workers
+    threads: Threads
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit."""
+        check_least("seed", self.seed, 0)
+        for key in ("num_maps", "num_states", "num_rollouts"):
+            check_least(key, getattr(self, key), 1)
+        resolve_processes(self.num_workers, self.num_maps)
+        runtime.resolve_threads(self.threads)
+
+
+@dataclass(frozen=True)
+class PublishSettings:
+    """The root of ``conf/publish.yaml``."""
+
+    runs: tuple[str, ...]
+    checkpoint: Name
+    weights: str
+    results: str
+
+    def __post_init__(self) -> None:
+        """Refuse a publication of nothing."""
+        if not self.runs:
+            raise UserInputError("name what to publish: runs=[<folder>,..]")

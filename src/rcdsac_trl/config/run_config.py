@@ -1,0 +1,144 @@
+"""The config as checked settings: the only module that knows how a config is laid out."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.config.algo_settings import AlgoSettings
+from rcdsac_trl.config.compose import choices
+from rcdsac_trl.config.course_settings import CourseSettings
+from rcdsac_trl.config.evaluation_settings import (
+    CalibrationSettings,
+    EvaluationSettings,
+    ExportSettings,
+    PublishSettings,
+)
+from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
+from rcdsac_trl.config.typed import read
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.world.task.rules import TaskSettings
+
+CONFIG_NAME = "config.yaml"
+"""What makes a folder a run folder."""
+CHECKPOINTS = "checkpoints"
+"""The folder of a run's checkpoints, in the run folder."""
+
+Settings = TypeVar("Settings")
+
+
+def training_settings(cfg: DictConfig) -> TrainingSettings:
+    """Read the config of a training.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work; without an algorithm, a sentence lists the choices.
+    """
+    return _training_settings(_plain(cfg))
+
+
+def _training_settings(values: dict[str, Any]) -> TrainingSettings:
+    if values.get("algo") is None:
+        raise UserInputError(f"no algorithm chosen: add +algo=<name>, one of {', '.join(choices('algo'))}")
+    return read(TrainingSettings, values)
+
+
+def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
+    """Read the config of an evaluation.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(EvaluationSettings, _plain(cfg))
+
+
+def calibration_settings(cfg: DictConfig) -> CalibrationSettings:
+    """Read the config of a calibration.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(CalibrationSettings, _plain(cfg))
+
+
+def course_settings(cfg: DictConfig) -> CourseSettings:
+    """Read the config of a drive over the course.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(CourseSettings, _plain(cfg))
+
+
+def export_settings(cfg: DictConfig) -> ExportSettings:
+    """Read the config of an export.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(ExportSettings, _plain(cfg))
+
+
+def publish_settings(cfg: DictConfig) -> PublishSettings:
+    """Read the config of a publication.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(PublishSettings, _plain(cfg))
+
+
+@dataclass(frozen=True)
+class AgentOfRun:
+    """The sections of a run's config that say what its agent is, and nothing of how it was trained."""
+
+    algo: AlgoSettings
+    sensor: SensorSettings
+    network: Widths
+    task: TaskSettings
+
+
+def agent_of_run(folder: Path) -> AgentOfRun:
+    """Read what a run's agent is; runs whose training other versions would not continue can be read, too.
+
+    Raises:
+        UserInputError: as :func:`settings_of_run`.
+    """
+    names = ("algo", "sensor", "network", "task")
+    return _of_run(folder, "run", lambda values: read(AgentOfRun, {n: values[n] for n in names if n in values}))
+
+
+def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
+    """Read what a run was trained with.
+
+    Args:
+        folder: of the run.
+        key: the key that named it, for messages.
+
+    Raises:
+        UserInputError: if the folder holds no run, or one that this version cannot read.
+    """
+    return _of_run(folder, key, _training_settings)
+
+
+def _of_run(folder: Path, key: str, reader: Callable[[dict[str, Any]], Settings]) -> Settings:
+    path = folder / CONFIG_NAME
+    if not os.path.isfile(path):  # false for a name that is too long, too
+        raise UserInputError(f"{key}={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
+    try:
+        cfg = OmegaConf.load(path)
+        if not isinstance(cfg, DictConfig):
+            raise UserInputError("it holds no keys")
+        return reader(_plain(cfg))
+    except (OSError, ValueError, TypeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())
+        raise UserInputError(f"{path} cannot be read ({reason}): name a folder that this version wrote") from error
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(cfg, resolve=True)  # type: ignore[return-value]

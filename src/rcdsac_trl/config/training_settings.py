@@ -1,0 +1,158 @@
+"""All that a training, an evaluation or a calibration may choose, checked as a whole.
+
+The outermost classes are the roots of ``train.yaml``, ``evaluate.yaml``, ``calibrate.yaml``, ``export.yaml`` and
+``search.yaml`` in ``conf/``; :class:`ExperimentSettings` is what a sweep (``sweep.yaml``) makes its runs of.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.config.algo_settings import AlgoSettings
+from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
+from rcdsac_trl.config.learner_settings import LearnerSettings
+from rcdsac_trl.config.schedule import Schedule
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system import runtime
+from rcdsac_trl.system.checks import check_least
+from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.task.rules import TaskSettings
+from rcdsac_trl.world.task.world_settings import WorldSettings
+
+Threads = int | Literal["auto"]
+Workers = int | Literal["auto"]
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """Which bins of the range sensor are seen (``conf/sensor``); :class:`WorldSettings` knows the names."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class LoggerSettings:
+    """Where scalars go (``conf/logger``); a training checks the names, an evaluation of it need not have them."""
+
+    backends: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TeamSettings:
+    """The agents that drive side by side; :class:`WorldSettings` checks that the workers can share them."""
+
+    num_agents: int
+    num_workers: Workers
+    worker_timeout_s: float | None
+    max_restarts: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is below 0."""
+        check_least("world.max_restarts", self.max_restarts, 0)
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """The replay's size."""
+
+    capacity_steps: int
+
+
+@dataclass(frozen=True)
+class ValidationSettings:
+    """When and how long training looks at its agent."""
+
+    every_iterations: int
+    num_maps: int
+    processes: Workers
+
+    def __post_init__(self) -> None:
+        """Refuse what is below its limit."""
+        check_least("validation.every_iterations", self.every_iterations, 1)
+        check_least("validation.num_maps", self.num_maps, 1)
+        if self.processes != "auto":
+            check_least("validation.processes", self.processes, 0)
+
+
+@dataclass(frozen=True)
+class CheckpointSettings:
+    """When training saves everything, and how much of that stays."""
+
+    every_iterations: int
+    keep: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is below 1."""
+        check_least("checkpoint.every_iterations", self.every_iterations, 1)
+        check_least("checkpoint.keep", self.keep, 1)
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """The root of ``conf/train.yaml``; every section is checked by its own class, here what spans several."""
+
+    algo: AlgoSettings
+    sensor: SensorSettings
+    map: MapSettings
+    task: TaskSettings
+    logger: LoggerSettings
+    resume: str | None
+    seed: int
+    device: str
+    threads: Threads
+    world: TeamSettings
+    network: Widths
+    learner: LearnerSettings
+    replay: ReplaySettings
+    schedule: Schedule
+    validation: ValidationSettings
+    checkpoint: CheckpointSettings
+    # Runs of earlier versions name none: this is what they had.
+    collector: CollectorSettings = SINGLE
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together, or not this machine."""
+        check_least("seed", self.seed, 0)
+        runtime.resolve_threads(self.threads)
+        self.collector.check_agents(self.world.num_agents)
+        if self.collector.name != "single" and self.world.num_workers != 0:
+            raise UserInputError(
+                f"world.num_workers={self.world.num_workers} does nothing with collector={self.collector.name}: give "
+                "collector.num_processes, or take collector=single"
+            )
+        if self.schedule.distortion_strength(0) < 1:
+            self.algo.distortion.measure.temper(0.0, 0.0)  # refuses a measure without a neutral beta
+        if not self.algo.default_conditions:
+            raise UserInputError(
+                "algo.distortion.evaluation_betas=[] leaves nothing to validate: give one beta or more"
+            )
+        episode_steps, sequence_length = self.task.episode_steps, self.learner.sequence_length
+        if sequence_length > episode_steps:
+            raise UserInputError(
+                f"learner.sequence_length={sequence_length} is longer than an episode of "
+                f"task.episode_steps={episode_steps} transitions: shorten it"
+            )
+        iteration_steps = self.training_world.num_agents * episode_steps
+        if self.replay.capacity_steps < iteration_steps:
+            raise UserInputError(
+                f"replay.capacity_steps={self.replay.capacity_steps} does not hold the {iteration_steps} steps of one "
+                "iteration (world.num_agents x task.episode_steps): raise it"
+            )
+
+    @property
+    def training_world(self) -> WorldSettings:
+        """What the training environment is made of."""
+        return WorldSettings(
+            map_settings=self.map,
+            task=self.task,
+            sensor=self.sensor.name,
+            num_agents=self.world.num_agents,
+            num_workers=self.world.num_workers,
+            worker_timeout_s=self.world.worker_timeout_s,
+        )
+
+    @property
+    def replay_steps(self) -> int:
+        """Steps that the replay is made for: no more than the run can fill."""
+        steps = self.schedule.iterations * self.world.num_agents * self.task.episode_steps
+        return min(self.replay.capacity_steps, steps)

@@ -1,0 +1,116 @@
+"""An agent as torch modules that take one step: what is exported, and what everything else is held against."""
+
+import torch
+from torch import Tensor, nn
+
+from rcdsac_trl.agent.networks import ActorHead, Encoder, QuantileHead, ScalarHead, Widths
+from rcdsac_trl.agent.risk import RiskMeasure, make_measure
+from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights
+
+ACTION_SIZE = 2
+
+
+class ActorStep(nn.Module):
+    """One step of the actor: observations, what it is told and the memory before to the action and the memory after.
+
+    Args:
+        weights: of the agent.
+    """
+
+    def __init__(self, weights: Weights) -> None:
+        super().__init__()
+        config, widths = weights.config, Widths(**weights.config.network)
+        self.encoder = Encoder(config.vectors, widths)
+        self.head = ActorHead(ACTION_SIZE, widths, measure_of(config))
+        self.weighted = config.context == "collision_weight"
+        _load(self.encoder, weights, "actor.encoder")
+        _load(self.head, weights, "actor.head")
+
+    def forward(
+        self, range_: Tensor, waypoint: Tensor, velocity: Tensor, context: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the action tanh(mean) [B, 2] and the next memory [B, memory].
+
+        Args:
+            range_: range observation, [B, 180].
+            waypoint: [B, 6].
+            velocity: [B, 4].
+            context: ``beta`` or the collision weight, [B, 1]; not read by an agent that is told neither.
+            memory: [B, memory]; zeros at the start.
+        """
+        memory = _encode(self.encoder, range_, waypoint, velocity, context if self.weighted else None, memory)
+        loc, _ = self.head(memory, None if self.head.measure is None else context)
+        return torch.tanh(loc), memory
+
+
+class CriticStep(nn.Module):
+    """One step of all critics: observations and the action to the lower of their quantiles (or means).
+
+    Args:
+        weights: of the agent.
+        fractions: of the quantiles, [N].
+    """
+
+    fractions: Tensor
+
+    def __init__(self, weights: Weights, fractions: Tensor) -> None:
+        super().__init__()
+        config, widths = weights.config, Widths(**weights.config.network)
+        numbers = range(config.num_critics)
+        self.encoders = nn.ModuleList(Encoder(config.vectors, widths) for _ in numbers)
+        self.heads = nn.ModuleList(_critic_head(config, widths) for _ in numbers)
+        self.weighted = config.context == "collision_weight"
+        self.register_buffer("fractions", fractions.reshape(1, 1, -1))
+        for number in numbers:
+            _load(self.encoders[number], weights, f"critics.{number}.encoder")
+            _load(self.heads[number], weights, f"critics.{number}.head")
+
+    def forward(
+        self, range_: Tensor, waypoint: Tensor, velocity: Tensor, context: Tensor, action: Tensor, memories: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return quantiles [B, N] (or the mean [B, 1]) and the next memories [critics, B, memory].
+
+        Args:
+            range_: range observation, [B, 180].
+            waypoint: [B, 6].
+            velocity: [B, 4].
+            context: as in :meth:`ActorStep.forward`, [B, 1].
+            action: [B, 2].
+            memories: [critics, B, memory]; zeros at the start.
+        """
+        given = context if self.weighted else None
+        values, after = [], []
+        for number, (encoder, head) in enumerate(zip(self.encoders, self.heads, strict=True)):
+            assert isinstance(encoder, Encoder)
+            memory = _encode(encoder, range_, waypoint, velocity, given, memories[number])
+            after.append(memory)
+            if isinstance(head, QuantileHead):
+                risk = None if head.measure is None else context.unsqueeze(1)
+                values.append(head(memory.unsqueeze(1), action.unsqueeze(1), self.fractions, risk).squeeze(1))
+            else:
+                values.append(head(memory, action))
+        return torch.stack(values).amin(dim=0), torch.stack(after)
+
+
+def measure_of(config: AgentConfig) -> RiskMeasure | None:
+    """Return the measure whose ``beta`` the networks read; None where they read none."""
+    return make_measure(config.measure) if config.context == "beta" else None
+
+
+def _critic_head(config: AgentConfig, widths: Widths) -> nn.Module:
+    if config.critic == "scalar":
+        return ScalarHead(ACTION_SIZE, widths)
+    return QuantileHead(ACTION_SIZE, widths, measure_of(config))
+
+
+def _encode(
+    encoder: Encoder, range_: Tensor, waypoint: Tensor, velocity: Tensor, weight: Tensor | None, memory: Tensor
+) -> Tensor:
+    vectors = (waypoint, velocity) if weight is None else (waypoint, velocity, weight)
+    is_first = torch.zeros(len(range_), 1, dtype=torch.bool)
+    return encoder.step(range_, *vectors, is_first, memory)
+
+
+def _load(module: nn.Module, weights: Weights, prefix: str) -> None:
+    module.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in weights.part(prefix).items()})
+    module.requires_grad_(False)

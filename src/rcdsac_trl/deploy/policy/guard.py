@@ -1,0 +1,191 @@
+"""What stands between an agent and the wheels: a speed limit and a stop zone that know nothing of the agent.
+
+The stop zone is the way the robot would still go if it did what it is told for one more reaction time and then braked:
+the whole way must keep its distance from everything that the range sensor sees. What lies behind an obstacle counts as
+obstacle.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.deploy.sensors.sectors import BIN_RAD, Sectors
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.limits import (
+    MAX_ANGULAR_ACCELERATION,
+    MAX_ANGULAR_VELOCITY,
+    MAX_LINEAR_ACCELERATION,
+    MAX_LINEAR_VELOCITY,
+    MIN_LINEAR_VELOCITY,
+)
+from rcdsac_trl.robot.range_sensor import NUM_BINS
+
+# Shares of the wanted speed that are tried, the fastest first.
+_SHARES = (1.0, 0.75, 0.5, 0.25)
+# Time from one place on the way to the next, s: 3 cm at full speed.
+_STEP_S = 0.05
+# What is in a sector may be anywhere in it, so a wall beside the robot looks up to this much nearer farther on: who is
+# within the margin may seem to come so much nearer, but never below the least that must stay.
+_BLUR_M = 0.01
+_LEAST_M = 0.01
+# Half the angle ahead (or behind) in which something must be sensed at all before the robot moves that way.
+_WAY_RAD = math.radians(30.0)
+
+# Below, the robot stands.
+_STANDS_M_PER_S = 1e-9
+_TWICE_BRAKING = 2.0 * MAX_LINEAR_ACCELERATION
+
+_ANGLES = np.arange(NUM_BINS) * BIN_RAD
+# Border i is the one between sectors i - 1 and i.
+_BORDERS = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)))
+_SECTORS_BEFORE = np.arange(NUM_BINS) - 1
+_MIDDLES = (_ANGLES + math.pi) % (2.0 * math.pi) - math.pi + BIN_RAD / 2.0
+_AHEAD = np.abs(_MIDDLES) < _WAY_RAD
+_BEHIND = np.abs(_MIDDLES) > math.pi - _WAY_RAD
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Limits that no command of an agent leaves.
+
+    Attributes:
+        max_speed_m_per_s: forwards.
+        max_reverse_m_per_s: backwards, as a positive number.
+        max_turn_rad_per_s: either way.
+        radius_m: of the circle around the robot's centre that holds the robot.
+        margin_m: what is kept between that circle and everything that is sensed. Who is nearer may drive along it
+            or away from it, and nearer by 1 cm a call, the blur of a sector, until 1 cm is left.
+        reaction_s: how long a command may last until the next one arrives and acts.
+        blind_reverse: whether the robot may drive backwards (or forwards) where it senses nothing at all.
+
+    Raises:
+        UserInputError: if a limit is negative, or the radius is not positive.
+
+    Example:
+        >>> wall = Sectors(np.full(NUM_BINS, 0.31), np.ones(NUM_BINS, dtype=bool))
+        >>> Guard().limit(0.6, 0.0, wall)[:2]
+        (0.0, 0.0)
+    """
+
+    max_speed_m_per_s: float = MAX_LINEAR_VELOCITY
+    max_reverse_m_per_s: float = -MIN_LINEAR_VELOCITY
+    max_turn_rad_per_s: float = MAX_ANGULAR_VELOCITY
+    radius_m: float = 0.25
+    margin_m: float = 0.05
+    reaction_s: float = 0.25
+    blind_reverse: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is no limit."""
+        for name in ("max_speed_m_per_s", "max_reverse_m_per_s", "max_turn_rad_per_s", "margin_m", "reaction_s"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise UserInputError(f"{name}={getattr(self, name)} of the guard must be a number of 0 or more")
+        if not 0.0 < self.radius_m < math.inf:
+            raise UserInputError(f"radius_m={self.radius_m} of the guard must be a positive number of metres")
+
+    def limit(
+        self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[float, float, str | None]:
+        """Return the velocities that may be driven, and why they are not those that were wanted.
+
+        The linear velocity is lowered, to 0 if need be; turning on the spot is always allowed.
+
+        Args:
+            v: wanted linear velocity, m/s.
+            omega: wanted angular velocity, rad/s.
+            sectors: what the range sensor sees, all of it, not just what the agent sees.
+            moving: measured velocities, m/s and rad/s.
+        """
+        fast, turning = v, omega
+        v = min(max(v, -self.max_reverse_m_per_s), self.max_speed_m_per_s)
+        omega = min(max(omega, -self.max_turn_rad_per_s), self.max_turn_rad_per_s)
+        reason = None if (v, omega) == (fast, turning) else "the speed limit"
+        if v == 0.0:
+            return v, omega, reason
+        if not self.blind_reverse and not np.count_nonzero(sectors.covered[_AHEAD if v > 0.0 else _BEHIND]):
+            return 0.0, omega, f"nothing senses what lies {'ahead' if v > 0 else 'behind'}"
+        share = self._fastest(v, omega, sectors, moving)
+        if share == 0.0:
+            return 0.0, omega, "the stop zone"
+        return share * v, omega, reason if share == 1.0 else "the stop zone"
+
+    def _fastest(self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float]) -> float:
+        """Return the largest of the shares of `v` whose way keeps its distance, 0 if none does."""
+        # Along a border, both sectors beside it are seen: whatever is inside a sector lies between its borders, at its
+        # distance or farther.
+        nearest = np.minimum(sectors.distances_m, sectors.distances_m[_SECTORS_BEFORE])
+        # What is out of reach of the whole way cannot be near to any of it.
+        seen = nearest < self._reach(max(abs(v), abs(moving[0])))
+        if not np.count_nonzero(seen):
+            return 1.0
+        clearance = _distances(self._ways(v, omega, moving), _BORDERS[:, seen], nearest[seen]) - self.radius_m
+        now = float(clearance[0, 0])
+        needed = min(self.margin_m, max(now - _BLUR_M, _LEAST_M), now)
+        least = clearance.min(axis=1).tolist()
+        return next((share for share, left in zip(_SHARES, least, strict=True) if left >= needed), 0.0)
+
+    def _reach(self, speed: float) -> float:
+        """Return how near to here, m, something must be to matter to who is never faster than `speed`."""
+        return self.radius_m + self.margin_m + speed * (self.reaction_s + _STEP_S) + speed**2 / _TWICE_BRAKING
+
+    def _ways(self, v: float, omega: float, moving: tuple[float, float]) -> NDArray[np.float64]:
+        """Return the places the robot's centre comes by until it stands, itself first, for each share of `v`.
+
+        Returns:
+            [shares, n, 2], m; who stands before the others do stays where it is.
+        """
+        reacting = math.ceil(self.reaction_s / _STEP_S - 1e-9)
+        speeds = [_until_it_stands(share * v, moving[0], reacting) for share in _SHARES]
+        steps = max(len(of_share) for of_share in speeds)
+        covered_m = np.array([of_share + [0.0] * (steps - len(of_share)) for of_share in speeds]) * _STEP_S
+        places = np.zeros((len(_SHARES), steps + 1, 2))
+        # The turn does not depend on the speed.
+        np.cumsum(covered_m[:, :, None] * _directions(omega, moving[1], reacting, steps), axis=1, out=places[:, 1:])
+        return places
+
+
+def _until_it_stands(v: float, now: float, reacting: int) -> list[float]:
+    """Return the linear velocity in each step: `v` is wanted in the first ones, and to stand from then on."""
+    speeds: list[float] = []
+    while len(speeds) < reacting or abs(now) > _STANDS_M_PER_S:
+        now = _nearer(v if len(speeds) < reacting else 0.0, now, MAX_LINEAR_ACCELERATION * _STEP_S)
+        speeds.append(now)
+    return speeds
+
+
+def _directions(omega: float, now: float, reacting: int, steps: int) -> NDArray[np.float64]:
+    """Return cosine and sine of the mean direction in each step, [steps, 2]; see :func:`_until_it_stands`."""
+    yaw, directions = 0.0, []
+    for step in range(steps):
+        now = _nearer(omega if step < reacting else 0.0, now, MAX_ANGULAR_ACCELERATION * _STEP_S)
+        half = now * _STEP_S / 2.0
+        directions.append((math.cos(yaw + half), math.sin(yaw + half)))
+        yaw += 2.0 * half
+    return np.array(directions)
+
+
+def _nearer(wanted: float, now: float, change: float) -> float:
+    """Return the velocity after a step, as ``interface.clip_command`` has it, of one of the two alone."""
+    return now + change if wanted > now + change else now - change if wanted < now - change else wanted
+
+
+def _distances(
+    places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how far each place is from what is sensed, m, [...].
+
+    Args:
+        places: [..., 2].
+        borders: directions of unit length, [2, m].
+        nearest: in each direction, how far from here on there may be something, m, [m].
+    """
+    along = places @ borders
+    point = np.maximum(along, nearest)
+    # |place - point u|^2 = |place|^2 + point (point - 2 place u) for a direction u, in few passes over large arrays.
+    along *= 2.0
+    np.subtract(point, along, out=along)
+    along *= point
+    squared = along.min(axis=-1) + np.square(places).sum(axis=-1)
+    return np.sqrt(np.maximum(squared, 0.0))

@@ -1,0 +1,297 @@
+"""The object that drives: observations in, a velocity command and the risk of it out, one call a control period."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.deploy.policy.checks import (
+    BadInputError,
+    InputLimits,
+    Stamps,
+    check_stamps,
+    sectors_of,
+    velocity_of,
+    waypoints_of,
+)
+from rcdsac_trl.deploy.policy.command import Command, Outlook
+from rcdsac_trl.deploy.policy.guard import Guard
+from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
+from rcdsac_trl.deploy.policy.weights import Weights
+from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.observation import range_observation, waypoint_observation
+from rcdsac_trl.robot.range_sensor import sensor_mask
+
+# After so many calls without good input in a row, or so many of the longest periods of training without one, the memory
+# is of another situation.
+_FORGET_AFTER = 3
+_RECOVERS = "it drives on with the next good input"
+_AT_ORIGIN = (0.0, 0.0, 0.0)
+
+
+def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
+    """Return the midpoints of equal parts of [0, 1], float32 [num_quantiles].
+
+    Raises:
+        UserInputError: if the number is below 1.
+    """
+    if num_quantiles < 1:
+        raise UserInputError(f"num_quantiles={num_quantiles} is below 1: ask for at least one")
+    return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
+
+
+class Policy:
+    """A trained agent that drives a robot.
+
+    Call :meth:`act` once in every control period, which is about 0.14 s. It never raises for what a message holds: on
+    bad input the command is to stand, with the reason. Not for use from several threads at once.
+
+    Args:
+        weights: of the agent, from :func:`rcdsac_trl.deploy.read_weights`.
+        guard: speed limit and stop zone; None drives without, which is for simulations that count collisions.
+        limits: how old, and how gappy, input may be.
+        num_quantiles: at how many fractions the return's distribution is told.
+
+    Attributes:
+        config: what the agent is.
+        fractions: of the quantiles, the midpoints of equal parts of [0, 1], float32 [N].
+        default_beta: what ``beta`` is where none is given, the middle of the trained range (-1 for the power law);
+            None for an agent that is told none.
+    """
+
+    def __init__(
+        self,
+        weights: Weights,
+        *,
+        guard: Guard | None = Guard(),  # noqa: B008 (frozen)
+        limits: InputLimits = InputLimits(),  # noqa: B008 (frozen)
+        num_quantiles: int = 16,
+    ) -> None:
+        self.config = weights.config
+        self.guard = guard
+        self.limits = limits
+        self.fractions = fractions_of(num_quantiles)
+        context = self.config.context_range
+        middle = None if context is None else (context[0] + context[1]) / 2.0
+        self.default_beta = middle if self.config.context == "beta" else None
+        self._default_weight = middle if self.config.context == "collision_weight" else None
+        self._mask = sensor_mask(self.config.sensor)
+        parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
+        self._encoders = Encoders([weights.part(f"{part}.encoder") for part in parts], self._mask)
+        self._actor = Actor(weights)
+        self._critics = Critics(weights, self.fractions)
+        self._halted = False
+        self._memories: Array
+        self._steps: int
+        self._commanded: tuple[float, float]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything before: call it where the robot is put somewhere else, or gets a new task."""
+        self._forget()
+        self._refused = 0
+        self._last: Stamps | None = None
+        self._last_fresh: Stamps | None = None
+        self._wanted: tuple[float, float] | None = None
+        self._told: tuple[NDArray[np.float32] | None, float] | None = None
+
+    def foresee(self, beta: float | None = None, *, action: Any = None) -> Outlook:
+        """Return what the agent would do with another `beta` where it stands now, and what it expects of that.
+
+        It changes nothing: the memory, which does not depend on `beta`, is that of the last :meth:`act`. A copy,
+        ``copy.copy(policy)``, keeps the situation for later.
+
+        Args:
+            beta: how much risk to take; None: :attr:`default_beta`.
+            action: what to expect of another action than its own, [2], each in [-1, 1].
+
+        Raises:
+            UserInputError: if nothing was seen since :meth:`reset`, the agent is told a collision weight, which is
+                part of its memory, `beta` is refused by :meth:`act`, too, or `action` is no action.
+
+        Example:
+            >>> policy = Policy(weights)  # doctest: +SKIP
+            >>> policy.act(ranges, waypoints, velocity, beta=0.0)  # doctest: +SKIP
+            >>> policy.foresee(-2.0).wanted  # doctest: +SKIP
+        """
+        if self._steps == 0:
+            raise UserInputError("nothing was seen since the memory was cleared: call act() first")
+        if self.config.context == "collision_weight":
+            raise UserInputError(
+                f"the memory of {self.config.name} depends on its collision weight: call act() instead"
+            )
+        embedded = self._embedded(self.check_beta(beta))
+        if action is None:
+            return self._outlook(embedded)
+        asked = np.asarray(action, dtype=np.float32)
+        if asked.shape != (2,) or not np.all(np.abs(asked) <= 1.0):
+            raise UserInputError(f"action={action} is not two numbers from -1 to 1: give u_0 and u_1")
+        return self._outlook(embedded, asked)
+
+    def check_beta(self, beta: float | None) -> float | None:
+        """Return what the agent is told for a `beta`, None where that is nothing.
+
+        Raises:
+            UserInputError: if :meth:`act` would refuse to drive with it.
+        """
+        try:
+            return self._context(beta, None)
+        except BadInputError as error:
+            raise UserInputError(str(error)) from None
+
+    def stop(self) -> None:
+        """Make every command one to stand, until :meth:`resume`."""
+        self._halted = True
+
+    def resume(self) -> None:
+        """End a :meth:`stop`."""
+        self._halted = False
+
+    def act(
+        self,
+        ranges: Any,
+        waypoints: Any,
+        velocity: Any,
+        beta: float | None = None,
+        *,
+        collision_weight: float | None = None,
+        stamps: Stamps | None = None,
+    ) -> Command:
+        """Return the command for this control period.
+
+        Args:
+            ranges: what the range sensor says: distances [180] in m by sector, ``inf`` where nothing is;
+                :class:`~rcdsac_trl.deploy.Sectors` from clouds; or a :class:`~rcdsac_trl.deploy.Scan`.
+            waypoints: the next two, x and y in m in the robot's frame, [2, 2]; on the last leg the goal alone, [2].
+            velocity: measured, m/s and rad/s, [2].
+            beta: how much risk to take; may change at every call. None: :attr:`default_beta`.
+            collision_weight: what agents of the row RCWR are told instead; None: the middle of the trained range.
+            stamps: when the input was measured; without them nobody notices what is late, repeated or out of order.
+        """
+        try:
+            if self._halted:
+                raise BadInputError("stop() was called")
+            return self._drive(ranges, waypoints, velocity, beta, collision_weight, stamps)
+        except BadInputError as error:
+            return self.refuse(str(error))
+
+    def _drive(
+        self,
+        ranges: Any,
+        waypoints: Any,
+        velocity: Any,
+        beta: float | None,
+        collision_weight: float | None,
+        stamps: Stamps | None,
+    ) -> Command:
+        if stamps is not None:
+            check_stamps(stamps, self._last, self.limits)
+        sectors = sectors_of(ranges, self._mask, self.limits)
+        next_two = waypoints_of(waypoints)
+        measured = velocity_of(velocity)
+        context = self._context(beta, collision_weight)
+        fresh = self._is_due(stamps)
+        self._refused = 0
+        self._last = stamps
+        forgot = self._steps == 0
+        if fresh:
+            self._last_fresh = stamps
+            self._ask(sectors, next_two, measured, context)
+        return self._command(sectors, measured, fresh, fresh and forgot)
+
+    def _is_due(self, stamps: Stamps | None) -> bool:
+        """Return whether the agent is asked; else the robot goes on as it was told last, guarded anew."""
+        last = self._last_fresh
+        if stamps is None or last is None or self._wanted is None:
+            return True
+        shortest, longest = self.config.period_s
+        since = stamps.now_s - last.now_s
+        if since > _FORGET_AFTER * longest:
+            self._forget()
+            return True
+        # The recurrent network counts time in steps: a second look at one scan, or one in half the time, is none.
+        return stamps.scan_s > last.scan_s and since > shortest / 2.0
+
+    def _ask(
+        self,
+        sectors: Sectors,
+        waypoints: tuple[tuple[float, float], tuple[float, float]],
+        measured: tuple[float, float],
+        context: float | None,
+    ) -> None:
+        config = self.config
+        bins = range_observation(sectors.distances_m, self._mask)
+        vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
+        if config.context == "collision_weight" and context is not None:
+            vectors.append(context)
+        self._memories = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._memories)
+        self._steps += 1
+        outlook = self._outlook(self._embedded(context))
+        self._wanted = outlook.wanted
+        self._told = outlook.quantiles, outlook.value
+
+    def _embedded(self, context: float | None) -> float | None:
+        """Return what the heads are told; None where they are told nothing."""
+        if self.config.embedding is None or context is None:
+            return None
+        return self.config.embedding[0] * context + self.config.embedding[1]
+
+    def _outlook(self, embedded: float | None, action: Array | None = None) -> Outlook:
+        if action is None:
+            action = self._actor.action(self._memories[0], embedded)
+        lower = self._critics.values(self._memories[1:], action, embedded)
+        quantiles = lower if self.config.critic == "quantile" else None
+        told = lower.tolist()  # of so few, Python's sum is the fastest mean
+        return Outlook(action, desired_velocities(action.tolist()), quantiles, sum(told) / len(told))
+
+    def _command(self, sectors: Sectors, measured: tuple[float, float], fresh: bool, forgot: bool) -> Command:
+        assert self._wanted is not None
+        assert self._told is not None
+        v, omega, reason = *self._wanted, None
+        if self.guard is not None:
+            v, omega, reason = self.guard.limit(v, omega, sectors, measured)
+        # Networks are told what the robot was told: the limits are part of the world.
+        self._commanded = (v, omega)
+        quantiles, value = self._told
+        told = None if reason is None else f"limited by {reason}; it ends when the cause does"
+        return Command(v, omega, False, told, self._wanted, quantiles, value, fresh, forgot)
+
+    def refuse(self, reason: str) -> Command:
+        """Return the command to stand for a reason that lies outside, and count it as bad input."""
+        self._refused += 1
+        self._commanded = (0.0, 0.0)
+        self._wanted = self._told = None
+        if self._refused >= _FORGET_AFTER:
+            self._forget()
+            self._last = self._last_fresh = None  # a clock that was set back is a clock
+        how = "resume() ends it" if self._halted else _RECOVERS
+        return Command(0.0, 0.0, True, f"{reason}; {how}")
+
+    def _context(self, beta: float | None, collision_weight: float | None) -> float | None:
+        config = self.config
+        given = {"beta": beta, "collision_weight": collision_weight}
+        for name, value in given.items():
+            if value is not None and not is_finite_number(value):
+                raise BadInputError(f"{name} is no finite number")
+            if value is None or name == config.context or (name == "beta" and value == config.fixed_beta):
+                continue
+            raise BadInputError(f"{name}={value:g} means nothing to this agent ({config.name}): leave it out")
+        if config.context is None or config.context_range is None:
+            return None
+        value = given[config.context]
+        if value is None:
+            value = self.default_beta if config.context == "beta" else self._default_weight
+        assert value is not None
+        low, high = config.context_range
+        if not low <= value <= high:
+            raise BadInputError(
+                f"{config.context}={value:g} is outside [{low:g}, {high:g}], where this agent was trained"
+            )
+        return float(value)
+
+    def _forget(self) -> None:
+        self._memories = np.zeros((self._encoders.number, self._encoders.size), dtype=np.float32)
+        self._commanded = (0.0, 0.0)
+        self._steps = 0

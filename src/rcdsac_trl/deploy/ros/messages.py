@@ -1,0 +1,145 @@
+"""ROS 2 messages to what a policy reads, and commands to messages; ROS itself is not needed.
+
+Messages are whatever has the fields of ROS's definitions: those of ``rclpy``, of ``rosbags``, or any other. Wrong ones
+raise :class:`~rcdsac_trl.errors.UserInputError`.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.deploy.policy.policy import Command
+from rcdsac_trl.deploy.sensors.scan import Scan
+from rcdsac_trl.deploy.sensors.sectors import Mount
+from rcdsac_trl.errors import UserInputError
+
+# sensor_msgs/PointField: number of a type to NumPy's.
+_POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def stamp_s(message: Any) -> float:
+    """Return the time in a message's header, s."""
+    stamp = message.header.stamp
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
+def scan_of(message: Any, mount: Mount | None = None) -> Scan:
+    """Return the scan in a ``sensor_msgs/LaserScan``.
+
+    Args:
+        message: the message.
+        mount: where the sensor sits, from the static transform to its frame; None for the robot's centre.
+    """
+    return Scan(
+        ranges=np.asarray(message.ranges, dtype=np.float64),
+        angle_min=float(message.angle_min),
+        angle_increment=float(message.angle_increment),
+        range_min=float(message.range_min),
+        range_max=float(message.range_max),
+        mount=mount or Mount(),
+    )
+
+
+def points_of(message: Any) -> NDArray[np.float64]:
+    """Return the points of a ``sensor_msgs/PointCloud2`` in its own frame, m, [n, 3].
+
+    Raises:
+        UserInputError: if it has no x, y and z as numbers, or less data than it says.
+    """
+    fields = {field.name: field for field in message.fields}
+    height, width, step, row = (int(getattr(message, name)) for name in ("height", "width", "point_step", "row_step"))
+    order = ">" if message.is_bigendian else "<"
+    names, formats, offsets = ["x", "y", "z"], [], []
+    for name in names:
+        field = fields.get(name)
+        kind = None if field is None else _POINT_TYPES.get(int(field.datatype))
+        if field is None or kind is None:
+            raise UserInputError(
+                f"the cloud's points have no {name}, only {', '.join(fields) or 'nothing'}: send x, y, z"
+            )
+        formats.append(order + kind)
+        offsets.append(int(field.offset))
+    data = np.frombuffer(bytes(message.data), dtype=np.uint8)
+    fits = all(0 <= o <= step - np.dtype(f).itemsize for o, f in zip(offsets, formats, strict=True))
+    if min(height, width) < 0 or not fits or row < width * step or len(data) < height * row:
+        raise UserInputError(
+            f"the cloud says {height} x {width} points of {step} bytes and has {len(data)} bytes: its sender is broken"
+        )
+    if height * width == 0:
+        return np.empty((0, 3))
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    rows = np.ascontiguousarray(data[: height * row].reshape(height, row)[:, : width * step])
+    points = rows.view(layout)
+    return np.stack([points[name].astype(np.float64).ravel() for name in names], axis=1)
+
+
+def velocity_of_odometry(message: Any) -> tuple[float, float]:
+    """Return the velocities in a ``nav_msgs/Odometry``, m/s and rad/s, which are in the robot's frame."""
+    twist = message.twist.twist
+    return float(twist.linear.x), float(twist.angular.z)
+
+
+def pose_of_odometry(message: Any) -> tuple[float, float, float]:
+    """Return x and y in m and yaw in rad of a ``nav_msgs/Odometry``, in its header's frame.
+
+    Raises:
+        UserInputError: if the orientation is no rotation.
+    """
+    pose = message.pose.pose
+    return float(pose.position.x), float(pose.position.y), _yaw(pose.orientation)
+
+
+def path_of(message: Any) -> NDArray[np.float64]:
+    """Return the points of a ``nav_msgs/Path``, m, [n, 2], in its header's frame."""
+    points = [(float(stamped.pose.position.x), float(stamped.pose.position.y)) for stamped in message.poses]
+    return np.array(points, dtype=np.float64).reshape(-1, 2)
+
+
+def twist_stamped(command: Command, now_s: float, make: Callable[[str], Any], *, frame_id: str = "base_link") -> Any:
+    """Return a command as ``geometry_msgs/TwistStamped``.
+
+    Args:
+        command: of the policy.
+        now_s: time for the header, s.
+        make: returns an empty message of the type with that name; see :func:`rosbags_maker`.
+        frame_id: of the header.
+    """
+    message = make("geometry_msgs/msg/TwistStamped")
+    nanoseconds = round(now_s * 1e9)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
+    message.header.frame_id = frame_id
+    message.twist.linear.x = command.v_m_per_s
+    message.twist.angular.z = command.omega_rad_per_s
+    return message
+
+
+def rosbags_maker(store: Any) -> Callable[[str], Any]:
+    """Return what makes empty messages of a ``rosbags`` type store: numbers 0, texts empty.
+
+    Args:
+        store: from ``rosbags.typesys.get_typestore``.
+    """
+    zeros = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
+
+    def value_of(description: Any) -> Any:
+        kind, detail = description
+        if kind.name == "NAME":
+            return make(detail)
+        if kind.name == "BASE":
+            return zeros.get(detail[0], 0)
+        raise UserInputError(f"messages with lists, such as {detail}, are not made here: make them by hand")
+
+    def make(name: str) -> Any:
+        return store.types[name](**{field: value_of(kind) for field, kind in store.fielddefs[name][1]})
+
+    return make
+
+
+def _yaw(q: Any) -> float:
+    x, y, z, w = (float(value) for value in (q.x, q.y, q.z, q.w))
+    if not abs(math.hypot(x, y, z, w) - 1.0) < 0.1:  # also false for NaN
+        raise UserInputError(f"orientation ({x:g}, {y:g}, {z:g}, {w:g}) is no rotation: its length must be 1")
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

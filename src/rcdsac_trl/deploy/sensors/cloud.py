@@ -1,0 +1,155 @@
+"""Point clouds of posed depth cameras to sectors: floor and ceiling off, own body off, the minimum of the rest."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rcdsac_trl.deploy.sensors.sectors import BIN_RAD, BODY_RADIUS_M, Sectors, bins_of, nearest_by_sector
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+
+
+@dataclass(frozen=True)
+class CameraPose:
+    """Where a camera sits: its frame in the robot's, x ahead, y left, z up from the floor below the centre.
+
+    Attributes:
+        position_m: of the camera, (x, y, z).
+        quaternion: rotation of the camera's frame, (x, y, z, w) as in ROS; need not be normalised.
+        view_rad: horizontal field of view, full angle.
+        optical: whether points are in an optical frame (z ahead, x right, y down) or in a body frame (x ahead, y
+            left, z up), before the rotation.
+    """
+
+    position_m: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    view_rad: float = math.radians(70.0)
+    optical: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is no pose."""
+        numbers = (*self.position_m, *self.quaternion, self.view_rad)
+        if len(numbers) != 8 or not all(math.isfinite(value) for value in numbers):
+            raise UserInputError(f"camera pose {numbers} is not three metres, a quaternion and an angle, all finite")
+        if math.hypot(*self.quaternion) < 1e-6:
+            raise UserInputError(
+                f"quaternion {self.quaternion} of a camera has no length: the identity is (0, 0, 0, 1)"
+            )
+        if not 0.0 < self.view_rad <= 2.0 * math.pi:
+            raise UserInputError(f"view_rad={self.view_rad:g} of a camera is outside (0, 2 pi]: give radians")
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """The matrix that turns points of the camera's frame into the robot's axes, [3, 3]."""
+        x, y, z, w = np.asarray(self.quaternion) / math.hypot(*self.quaternion)
+        turn = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        if self.optical:
+            turn = turn @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+        return turn
+
+    @property
+    def heading_rad(self) -> float:
+        """Direction in which the camera looks, seen from above, counter-clockwise from straight ahead."""
+        ahead = self.rotation @ (np.array([0.0, 0.0, 1.0]) if self.optical else np.array([1.0, 0.0, 0.0]))
+        return math.atan2(ahead[1], ahead[0])
+
+
+@dataclass(frozen=True)
+class CloudFilter:
+    """Which points are obstacles.
+
+    Attributes:
+        floor_m: what is lower is floor.
+        ceiling_m: what is higher is no obstacle: the robot fits below.
+        body_radius_m: what is nearer to the robot's centre, seen from above, is the robot.
+        support: this many points must be as near as a sector's distance: 1 is the exact minimum, more ignores the
+            single flying points of depth cameras at edges.
+        min_points: a camera that delivers fewer points (floor and ceiling included) is blind.
+    """
+
+    floor_m: float = 0.05
+    ceiling_m: float = 1.0
+    body_radius_m: float = BODY_RADIUS_M
+    support: int = 1
+    min_points: int = 50
+
+    def __post_init__(self) -> None:
+        """Refuse an empty slice, and counts below their least."""
+        if not self.floor_m < self.ceiling_m:
+            raise UserInputError(f"floor_m={self.floor_m:g} is not below ceiling_m={self.ceiling_m:g}")
+        if self.support < 1 or self.min_points < 0 or self.body_radius_m < 0.0:
+            raise UserInputError(
+                f"support={self.support} must be at least 1, min_points={self.min_points} and "
+                f"body_radius_m={self.body_radius_m:g} at least 0"
+            )
+
+
+def cloud_sectors(clouds: Sequence[tuple[ArrayLike, CameraPose]], filter_: CloudFilter | None = None) -> Sectors:
+    """Return what the clouds of several cameras say about each sector.
+
+    A cloud cannot say where it saw nothing, so its camera's field of view tells what it covers: the sectors whose
+    farthest points, 3 m from the robot's centre, it has in view. A blind camera covers nothing.
+
+    Args:
+        clouds: points [n, 3] or [h, w, 3] in the camera's frame, m, and the camera's pose, for each camera; points
+            that are not finite are left out.
+        filter_: which points are obstacles; None for the defaults.
+
+    Raises:
+        UserInputError: if points are no [.., 3] array of numbers.
+
+    Example:
+        >>> wall = np.stack(np.meshgrid([1.0], np.linspace(-1, 1, 99), np.linspace(0, 1, 9)), -1)
+        >>> sectors = cloud_sectors([(wall, CameraPose((0.2, 0.0, 0.0)))])
+        >>> round(float(sectors.distances_m[0]), 3), bool(sectors.covered[90])
+        (1.2, False)
+    """
+    filter_ = filter_ or CloudFilter()
+    covered = np.zeros(NUM_BINS, dtype=np.bool_)
+    bins: list[NDArray[np.intp]] = []
+    distances: list[NDArray[np.float64]] = []
+    for points, pose in clouds:
+        finite = _finite_points(points)
+        if len(finite) < max(filter_.min_points, 1):
+            continue
+        x, y, z = (finite @ pose.rotation.T + np.asarray(pose.position_m)).T
+        distance = np.hypot(x, y)
+        obstacle = (z >= filter_.floor_m) & (z <= filter_.ceiling_m) & (distance >= filter_.body_radius_m)
+        obstacle &= distance < MAX_RANGE_M
+        bins.append(bins_of(np.arctan2(y[obstacle], x[obstacle])))
+        distances.append(distance[obstacle])
+        covered |= _in_view(pose)
+    if not bins:
+        return Sectors(np.full(NUM_BINS, np.inf), covered)
+    nearest = nearest_by_sector(np.concatenate(bins), np.concatenate(distances), filter_.support)
+    return Sectors(nearest, covered | np.isfinite(nearest))
+
+
+def _finite_points(points: ArrayLike) -> NDArray[np.float64]:
+    try:
+        array = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserInputError("a cloud's points are not numbers: give x, y and z in metres") from error
+    if array.ndim < 2 or array.shape[-1] != 3:
+        raise UserInputError(f"a cloud of shape {list(array.shape)} is none: give [n, 3] or [height, width, 3]")
+    array = array.reshape(-1, 3)
+    return array[np.isfinite(array).all(axis=1)]
+
+
+def _in_view(pose: CameraPose) -> NDArray[np.bool_]:
+    """Return the sectors whose both borders a camera has in view at 3 m from the robot's centre."""
+    borders = np.arange(NUM_BINS) * BIN_RAD
+    x = MAX_RANGE_M * np.cos(borders) - pose.position_m[0]
+    y = MAX_RANGE_M * np.sin(borders) - pose.position_m[1]
+    off = np.arctan2(y, x) - pose.heading_rad
+    seen = np.abs((off + math.pi) % (2.0 * math.pi) - math.pi) <= pose.view_rad / 2.0
+    return seen & np.roll(seen, -1)

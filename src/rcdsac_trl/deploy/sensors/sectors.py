@@ -1,0 +1,93 @@
+"""What any range sensor says about the 180 sectors around the robot, and how it is mounted."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+
+BIN_RAD = 2.0 * math.pi / NUM_BINS
+"""Width of a sector."""
+BODY_RADIUS_M = 0.2
+"""What is nearer to the robot's centre is the robot itself: nothing else gets inside an octagon of 0.25 m, whose sides
+are 0.23 m away."""
+
+_NUMBER = int | float | np.number
+# Angles come as float32 and are multiples of an increment: a border itself must not fall to the wrong side.
+_BORDER_RAD = 2e-6
+
+
+@dataclass(frozen=True)
+class Sectors:
+    """The range sensor's answer, sector by sector; index 0 is [0, 2) degrees counter-clockwise from straight ahead.
+
+    Attributes:
+        distances_m: smallest distance from the robot's centre to anything in the sector, ``inf`` where nothing is
+            within 3 m, float64 [180].
+        covered: whether the sensor can say anything about the sector, bool [180]; elsewhere the distance is ``inf``.
+    """
+
+    distances_m: NDArray[np.float64]
+    covered: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where a planar sensor sits on the robot.
+
+    Attributes:
+        x_m: ahead of the robot's centre, m.
+        y_m: left of it, m.
+        yaw_rad: direction of the sensor's x axis, counter-clockwise from straight ahead.
+        upside_down: the sensor hangs: its angles count clockwise, seen from above.
+    """
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    upside_down: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is not finite."""
+        if not all(math.isfinite(value) for value in (self.x_m, self.y_m, self.yaw_rad)):
+            raise UserInputError(f"mount {self} is not finite: give metres and radians")
+
+
+def is_finite_number(value: object) -> bool:
+    """Tell whether something is one finite number, whatever it may be."""
+    try:
+        return isinstance(value, _NUMBER) and math.isfinite(float(value))
+    except (OverflowError, TypeError):
+        return False
+
+
+def bins_of(angles_rad: NDArray[np.floating]) -> NDArray[np.intp]:
+    """Return the sector (from 0) of each angle, any full turns apart; a border belongs to the sector it begins."""
+    return np.floor((angles_rad + _BORDER_RAD) / BIN_RAD).astype(np.intp) % NUM_BINS
+
+
+def nearest_by_sector(
+    bins: NDArray[np.intp], distances_m: NDArray[np.float64], support: int = 1
+) -> NDArray[np.float64]:
+    """Return the smallest distance in each sector, ``inf`` where nothing is within 3 m, float64 [180].
+
+    Args:
+        bins: sector of each point, [n].
+        distances_m: of each point, [n].
+        support: this many points must be at least as near: 1 is the exact minimum, more ignores single outliers.
+    """
+    near = distances_m < MAX_RANGE_M
+    bins, distances_m = bins[near], distances_m[near]
+    nearest = np.full(NUM_BINS, np.inf)
+    if support == 1:
+        np.minimum.at(nearest, bins, distances_m)
+        return nearest
+    order = np.lexsort((distances_m, bins))
+    bins, distances_m = bins[order], distances_m[order]
+    starts, ends = (np.searchsorted(bins, np.arange(NUM_BINS), side=side) for side in ("left", "right"))
+    enough = ends - starts >= support
+    nearest[enough] = distances_m[starts[enough] + support - 1]
+    return nearest

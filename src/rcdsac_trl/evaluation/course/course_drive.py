@@ -1,0 +1,215 @@
+"""One run over the course: all that the pilot learns comes from four depth cameras and odometry."""
+
+import contextlib
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
+from rcdsac_trl.deploy.policy.checks import Stamps
+from rcdsac_trl.deploy.policy.path import PathFollower
+from rcdsac_trl.deploy.policy.policy import Command
+from rcdsac_trl.evaluation.course.camera_rig import camera_poses, mounted, sectors_of_clouds
+from rcdsac_trl.evaluation.course.odometry import Odometry, Pose
+from rcdsac_trl.seeding import stream
+from rcdsac_trl.world.office.building import PERSON_HEIGHT_M, Office
+from rcdsac_trl.world.office.depth_cameras import DepthCameras, Lens
+from rcdsac_trl.world.sim.simulation import Simulation
+from rcdsac_trl.world.task.rules import collision_due
+
+Direction = Literal["forward", "reverse"]
+DIRECTIONS: tuple[Direction, ...] = ("forward", "reverse")
+
+# In motor steps of 0.02 s it is 7.5: a command takes effect at the next one, so it lasts 7 or 8 of them.
+_MOTOR_STEPS_OF_TWO = 15
+
+
+class Pilot(Protocol):
+    """Who drives: a :class:`rcdsac_trl.deploy.Policy`, or what behaves like one."""
+
+    config: Any
+    """Has ``waypoint_radius_m`` and ``goal_radius_m``."""
+
+    def reset(self) -> None:
+        """Forget everything before."""
+        ...
+
+    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None) -> Command:
+        """Return the command for this control period."""
+        ...
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What all runs of a course have in common."""
+
+    camera: Lens
+    odometry: OdometrySettings
+    time_limit_s: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What happened in a run; row 0 is the start, row k the state after k commands.
+
+    Attributes:
+        finished: whether the robot came to where it took the goal to be.
+        poses: the robot's true x, y and yaw, m and rad, float64 [n + 1, 3].
+        estimates: where it took itself to be, float64 [n + 1, 3].
+        people: where people were, m, float64 [n + 1, k, 2].
+        in_contact: whether the robot touched anything since the row before, bool [n + 1].
+        nearest_m: true distance from the robot's centre to whatever was nearest, float64 [n + 1].
+        distances_m: what the cameras said of each sector before the command, float64 [n, 180].
+        velocities: measured velocities before the command, m/s and rad/s, float64 [n, 2].
+        commands: what was commanded, m/s and rad/s, float64 [n, 2].
+        stopped: whether the pilot refused to drive, bool [n].
+        limited: whether speed limit or stop zone changed what the pilot wanted, bool [n].
+    """
+
+    finished: bool
+    poses: NDArray[np.float64]
+    estimates: NDArray[np.float64]
+    people: NDArray[np.float64]
+    in_contact: NDArray[np.bool_]
+    nearest_m: NDArray[np.float64]
+    distances_m: NDArray[np.float64]
+    velocities: NDArray[np.float64]
+    commands: NDArray[np.float64]
+    stopped: NDArray[np.bool_]
+    limited: NDArray[np.bool_]
+
+
+def course_of(office: Office, direction: Direction) -> NDArray[np.float64]:
+    """Return the course's corner points in the order in which they are driven, [k, 2], m."""
+    return office.course if direction == "forward" else office.course[::-1]
+
+
+def start_pose(course: NDArray[np.float64]) -> Pose:
+    """Return the pose at a course's beginning: the robot looks along its first leg."""
+    (x, y), (x_1, y_1) = course[:2].tolist()
+    return x, y, math.atan2(y_1 - y, x_1 - x)
+
+
+def motor_steps(step: int) -> int:
+    """Return how many motor steps a command lasts: 7 and 8 in turns, 0.15 s on average.
+
+    Example:
+        >>> [motor_steps(step) for step in range(4)]
+        [7, 8, 7, 8]
+    """
+    return (step + 1) * _MOTOR_STEPS_OF_TWO // 2 - step * _MOTOR_STEPS_OF_TWO // 2
+
+
+def drive_course(
+    office: Office,
+    pilot: Pilot,
+    beta: float | None,
+    direction: Direction,
+    repetition: int,
+    conditions: Conditions,
+    before_step: Callable[[], None],
+) -> Trace:
+    """Drive the course once.
+
+    People, odometry's errors and the cameras' noise derive from seed, direction and repetition: all pilots meet the
+    same, as far as they do the same.
+
+    Args:
+        office: where.
+        pilot: who.
+        beta: how much risk it takes; None for its default, or for none.
+        direction: forward or in reverse.
+        repetition: number of the run.
+        conditions: of all runs.
+        before_step: called before each command.
+    """
+    index = (DIRECTIONS.index(direction), repetition)
+    course = course_of(office, direction)
+    pose = start_pose(course)
+    odometry = Odometry(conditions.odometry, pose, stream(conditions.seed, "course/odometry", *index))
+    follower = PathFollower(course, pilot.config)
+    poses = camera_poses(conditions.camera.view_deg)
+    with (
+        contextlib.closing(Simulation()) as simulation,
+        contextlib.closing(
+            DepthCameras(
+                conditions.camera,
+                [mounted(camera) for camera in poses],
+                office.solids,
+                [(mover.radius, PERSON_HEIGHT_M) for mover in office.map.movers],
+                stream(conditions.seed, "course/cameras", *index),
+            )
+        ) as cameras,
+    ):
+        simulation.load(office.map, office.planner, pose, stream(conditions.seed, "course/people", *index))
+        pilot.reset()
+        states = [_state(simulation, odometry, False)]
+        steps: list[dict[str, Any]] = []
+        velocity = odometry.velocity(0.0, 0.0)
+        while (waypoints := follower.update(odometry.pose)) is not None:
+            now_s = len(steps) * PERIOD_S
+            if now_s + PERIOD_S > conditions.time_limit_s:
+                break
+            before_step()
+            seen = sectors_of_clouds(cameras.clouds(simulation.pose, simulation.mover_positions), poses)
+            stamps = Stamps(now_s, now_s, now_s, now_s)
+            command = pilot.act(seen, waypoints, velocity, beta, stamps=stamps)
+            commanded = (command.v_m_per_s, command.omega_rad_per_s)
+            moved = simulation.step(*commanded, motor_steps(len(steps)))
+            step = {"distances_m": seen.distances_m, "velocities": velocity, "commands": commanded}
+            limited = not command.stopped and command.reason is not None
+            steps.append(step | {"stopped": command.stopped, "limited": limited})
+            odometry.move(moved.pose, PERIOD_S)
+            velocity = odometry.velocity(moved.v_c, moved.omega_c)
+            states.append(_state(simulation, odometry, moved.in_contact))
+    return Trace(bool(follower.reached), **_columns(states), **_columns(steps))
+
+
+def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int | bool]:
+    """Return what a run amounts to.
+
+    Args:
+        trace: of the run.
+        course: as it was driven, [k, 2].
+
+    Returns:
+        `finished`; `time_s` until the end or the time limit; `collisions`, contacts that began; `contact_fraction` of
+        the steps; `driven_m`; `nearest_m`, smallest true distance from the robot's centre to anything; `stopped_steps`
+        and `limited_steps`, in which the pilot refused to drive, or its limits changed its wish; `goal_error_m`, true
+        distance to the goal at the end; `estimate_error_m`, the largest error of the estimated position.
+    """
+    contacts = trace.in_contact.tolist()
+    onsets = (collision_due(now, before, "onset") for before, now in itertools.pairwise(contacts))
+    return {
+        "finished": trace.finished,
+        "time_s": len(trace.commands) * PERIOD_S,
+        "collisions": sum(onsets),
+        "contact_fraction": float(trace.in_contact[1:].mean()),
+        "driven_m": float(np.hypot(*np.diff(trace.poses[:, :2], axis=0).T).sum()),
+        "nearest_m": float(trace.nearest_m.min()),
+        "stopped_steps": int(trace.stopped.sum()),
+        "limited_steps": int(trace.limited.sum()),
+        "goal_error_m": float(np.hypot(*(trace.poses[-1, :2] - course[-1]))),
+        "estimate_error_m": float(np.hypot(*(trace.estimates - trace.poses)[:, :2].T).max()),
+    }
+
+
+def _state(simulation: Simulation, odometry: Odometry, in_contact: bool) -> dict[str, Any]:
+    return {
+        "poses": simulation.pose,
+        "estimates": odometry.pose,
+        "people": simulation.mover_positions,
+        "in_contact": in_contact,
+        "nearest_m": simulation.scan().min(),
+    }
+
+
+def _columns(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+    """Stack rows that have the same keys."""
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}

@@ -1,0 +1,61 @@
+"""Ways of whole episodes in one picture: the same start and goals under several conditions, side by side."""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from rcdsac_trl.evaluation.film.episode_film import COLUMNS, FAINT, PAPER, Track, counted
+from rcdsac_trl.evaluation.film.recording import Moment
+from rcdsac_trl.world.render import TEXT, TOUCHING, Renderer, font
+
+_SIDE_PX = 560
+_SAID = "pale to dark: the way driven; numbered: goals reached;\nred: where a contact began; who walks is not shown"
+
+
+def ways(tracks: Sequence[Track]) -> NDArray[np.uint8]:
+    """Return the picture, uint8 RGB ``[height, width, 3]``: a panel an episode, at most four in a line.
+
+    Above each map stands what drove, below it what came of it.
+
+    Args:
+        tracks: whole episodes.
+    """
+    renderer, head = Renderer(_SIDE_PX), round(0.1 * _SIDE_PX)
+    columns = min(len(tracks), COLUMNS)
+    height = _SIDE_PX + 2 * head
+    sheet = Image.new("RGB", (columns * _SIDE_PX, math.ceil(len(tracks) / columns) * height + head), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    large, normal = font(0.042 * _SIDE_PX), font(0.034 * _SIDE_PX)
+    for number, track in enumerate(tracks):
+        left, top = number % columns * _SIDE_PX, number // columns * height
+        sheet.paste(Image.fromarray(_panel(track.moments, renderer)), (left, top + head))
+        draw.text((left + _SIDE_PX // 2, top + head // 2), track.heading, TEXT, font=large, anchor="mm")
+        last = track.moments[-1]
+        colour = TOUCHING if last.collisions else TEXT
+        below = (left + _SIDE_PX // 2, top + head + _SIDE_PX + head // 2)
+        draw.text(below, _outcome(track.moments), colour, font=normal, anchor="mm")
+    small = font(0.027 * _SIDE_PX)
+    middle = (_SIDE_PX * columns // 2, sheet.height - head // 2)
+    draw.multiline_text(middle, _SAID, FAINT, font=small, anchor="mm", align="center")
+    return np.array(sheet)
+
+
+def _panel(moments: Sequence[Moment], renderer: Renderer) -> NDArray[np.uint8]:
+    touches = [moments[0].scene.pose[:2]] if moments[0].collisions else []
+    goals = []
+    for then, now in itertools.pairwise(moments):
+        if now.collisions > then.collisions:
+            touches.append(now.scene.pose[:2])
+        if now.goals > then.goals:  # a goal that is reached is gone: the moment before still shows it
+            goals.append(tuple(then.scene.waypoints[-1].tolist()))
+    way = [moment.scene.pose[:2] for moment in moments]
+    return renderer.draw_way(moments[0].scene.map, way, goals, touches)
+
+
+def _outcome(moments: Sequence[Moment]) -> str:
+    last, speed = moments[-1], np.mean([moment.speed_m_per_s for moment in moments])
+    return f"{counted(last.collisions, 'collision')},  {counted(last.goals, 'goal')},  {speed:.2f} m/s"

@@ -1,0 +1,171 @@
+"""A sweep from its command line: what is meant for it, what for its runs, and which runs that makes."""
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from rcdsac_trl.config.algo_settings import AlgoSettings
+from rcdsac_trl.config.compose import combinations, compose, parse, sweep_folder
+from rcdsac_trl.config.experiment_settings import ExperimentSettings
+from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.config.typed import read
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.experiments.launchers import read_launcher
+from rcdsac_trl.experiments.sweep import Job, Sweep
+from rcdsac_trl.training.resume import differing_keys
+from rcdsac_trl.training.setup import check_training
+
+CONFIG = "sweep"
+_GROUPS = ("experiment", "launcher")
+_FOLDER = "hydra.sweep.dir"
+# What every name of a run says by itself.
+_NAMED = ("algo", "sensor", "seed")
+
+
+def is_meant_for_a_sweep(override: str) -> bool:
+    """Whether an override chooses runs, or where they run, and not what one of them does."""
+    key = _key(override)
+    return key == _FOLDER or key.split(".")[0] in _GROUPS
+
+
+def check_single(overrides: Iterable[str]) -> None:
+    """Refuse what only a sweep understands where one run is asked for.
+
+    Raises:
+        UserInputError: naming it.
+    """
+    for override in overrides:
+        if is_meant_for_a_sweep(override):
+            raise UserInputError(f"{override} is about several runs: add -m, or leave it out")
+
+
+def make_sweep(overrides: list[str]) -> Sweep:
+    """Make the sweep that a call of ``train -m`` asks for; checks all of its runs and writes nothing.
+
+    Args:
+        overrides: of the command line.
+
+    Raises:
+        UserInputError: for whatever cannot work, in any of the runs.
+    """
+    own = [_without_plus(override) for override in overrides if is_meant_for_a_sweep(override)]
+    given = [override for override in overrides if not is_meant_for_a_sweep(override)]
+    for override in given:
+        if re.match(r"hydra\b", _key(override)):
+            raise UserInputError(f"{override} has no effect on a sweep: leave it out, and choose launcher=<name>")
+        if _key(override) == "resume":
+            raise UserInputError(
+                f"{override} continues one run: leave -m out; a sweep goes on when its call is repeated with its "
+                f"{_FOLDER}"
+            )
+    cfg = compose(CONFIG, own)
+    values = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(values, dict)
+    experiment = read(ExperimentSettings, values["experiment"], "experiment")
+    launcher = read_launcher(values["launcher"])
+    # As composed once: its default name is the time.
+    folder = sweep_folder(CONFIG, [*own, f"experiment.name='{experiment.name}'"]).absolute()
+    jobs = list(_jobs(experiment, given, folder))
+    _check_names(jobs)
+    return Sweep(folder, experiment.name, jobs, launcher)
+
+
+def _jobs(experiment: ExperimentSettings, given: list[str], folder: Path) -> Iterator[Job]:
+    """Yield the jobs of an experiment, on top of whose runs come the overrides of the command line."""
+    if experiment.only is not None and (unknown := set(experiment.only) - experiment.runs.keys()):
+        raise UserInputError(
+            f"experiment.only={sorted(unknown)[0]} is no run of the experiment: choose among "
+            f"{', '.join(experiment.runs) or 'none, it has no named runs'}"
+        )
+    if not experiment.runs:
+        yield from _combined(experiment, None, _merged(experiment.every, given), folder)
+    for name, own in experiment.runs.items():
+        if experiment.only is not None and name not in experiment.only:
+            continue
+        _check_not_contradicted(name, own, given)
+        yield from _combined(experiment, name, _merged(experiment.every, own, given), folder)
+
+
+def _check_not_contradicted(name: str, own: Iterable[str], given: Iterable[str]) -> None:
+    makes = {_key(override): override for override in own}
+    for override in given:
+        if _key(override) in makes:
+            raise UserInputError(
+                f"{override} contradicts {makes[_key(override)]}, which makes the run {name} what it is: leave it "
+                "out, or choose other runs with experiment.only=[<name>]"
+            )
+
+
+def _merged(*layers: Iterable[str]) -> list[str]:
+    """Let later overrides take the place of earlier ones of the same key."""
+    found: dict[str, str] = {}
+    for layer in layers:
+        for override in layer:
+            found[_key(override)] = override
+    return list(found.values())
+
+
+def _combined(experiment: ExperimentSettings, run: str | None, overrides: list[str], folder: Path) -> Iterator[Job]:
+    varied = {_key(o.input_line or "") for o in parse(overrides) if o.is_sweep_override()}
+    for job in combinations(overrides):
+        cfg = compose("train", job)
+        check_training(cfg)
+        name = _name(run, cfg, [o for o in job if _key(o) in varied and _key(o) not in _NAMED])
+        if differing := differing_keys(folder / name, cfg):
+            raise UserInputError(
+                f"{folder / name} holds a run of another config ({', '.join(differing[:3])}): choose another {_FOLDER}"
+            )
+        yield Job(
+            name=name,
+            run=run,
+            algo=cfg.algo.name,
+            sensor=cfg.sensor.name,
+            seed=cfg.seed,
+            overrides=tuple(job),
+            evaluate=_evaluate(experiment, training_settings(cfg).algo),
+            folder=folder / name,
+        )
+
+
+def _name(run: str | None, cfg: DictConfig, varied: Iterable[str]) -> str:
+    """Name a job's folder by what tells it from others; stays the same when an experiment gets further runs."""
+    algo = cfg.algo.name
+    named = [] if run is None else [run]
+    if run is None or not run.startswith(algo):
+        named.append(algo)
+    parts = [*named, cfg.sensor.name, f"s{cfg.seed}"]
+    for override in varied:
+        key, _, value = override.lstrip("+").partition("=")
+        parts.insert(-1, f"{key.split('.')[-1]}_{value}")
+    return re.sub(r"[^\w.+-]+", "_", "-".join(parts))
+
+
+def _check_names(jobs: Iterable[Job]) -> None:
+    seen: dict[str, Job] = {}
+    for job in jobs:
+        if job.name in seen:
+            raise UserInputError(
+                f"two runs would share the folder {job.name} ({' '.join(seen[job.name].overrides)} and "
+                f"{' '.join(job.overrides)}): leave one out"
+            )
+        seen[job.name] = job
+
+
+def _evaluate(experiment: ExperimentSettings, algo: AlgoSettings) -> tuple[str, ...] | None:
+    """Return what `evaluate` is told of a job; a risk-conditioned agent must be given its betas."""
+    if experiment.evaluate is None:
+        return None
+    betas = algo.distortion.evaluation_betas if algo.conditioning == "per_episode" else ()
+    told = [f"beta=[{','.join(f'{beta:g}' for beta in betas)}]"] if betas else []
+    return tuple(_merged(told, experiment.evaluate))
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+~").partition("=")[0]
+
+
+def _without_plus(override: str) -> str:
+    """Read +experiment=<name>, which looks like +algo=<name>, as experiment=<name>."""
+    return override.lstrip("+") if _key(override) in _GROUPS else override

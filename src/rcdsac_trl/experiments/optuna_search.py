@@ -1,0 +1,240 @@
+"""A search for hyper-parameters with Optuna: TPE proposes, a training of its own tries, validation decides.
+
+Hydra's own Optuna sweeper wants an Optuna that is years old, and knows nothing of a trial before it has ended. Here
+Optuna is asked and told; a trial is a job as a sweep has them, and its validation table is read while it trains, so
+that it can be pruned. Everything Optuna knows is in its storage: a search that was killed goes on with the trials that
+were lost, from their checkpoints, and several processes may search together.
+
+Public names::
+
+    Number, Choice      what is searched
+    Search              the search
+"""
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from rcdsac_trl.config.experiment_settings import SearchSettings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.experiments.sweep import Job, State, execute
+from rcdsac_trl.seeding import torch_seed
+from rcdsac_trl.storage.atomic import FolderLock
+
+if TYPE_CHECKING:
+    import optuna
+
+_FOLDER = "folder"
+_NEIGHBOURS = 3  # trials that must have come as far before a median says anything
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number between two others.
+
+    Attributes:
+        low: smallest value.
+        high: largest value; where both are whole numbers, so is every one between them.
+        log: whether equal factors count alike, and not equal differences.
+    """
+
+    low: float
+    high: float
+    log: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is no range."""
+        if not self.low < self.high:
+            raise UserInputError(f"interval({self.low:g},{self.high:g}) is no range: give the smaller value first")
+        if self.log and self.low <= 0:
+            raise UserInputError(f"interval({self.low:g},{self.high:g}) has no logarithm: begin above 0")
+
+    def suggest(self, trial: "optuna.Trial", key: str) -> str:
+        """Let a trial choose, and write it as an override's value."""
+        if isinstance(self.low, int) and isinstance(self.high, int):
+            return str(trial.suggest_int(key, self.low, self.high, log=self.log))
+        return repr(trial.suggest_float(key, self.low, self.high, log=self.log))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of several values, written as on the command line."""
+
+    values: tuple[str, ...]
+
+    @property
+    def low(self) -> str:
+        """The first value."""
+        return self.values[0]
+
+    @property
+    def high(self) -> str:
+        """The last value."""
+        return self.values[-1]
+
+    def suggest(self, trial: "optuna.Trial", key: str) -> str:
+        """Let a trial choose, and write it as an override's value."""
+        value = trial.suggest_categorical(key, self.values)
+        assert isinstance(value, str)
+        return value
+
+
+Searched = Number | Choice
+
+
+class Search:
+    """Trials, and where they are.
+
+    Args:
+        folder: holds the trials' run folders, and Optuna's journal.
+        settings: how to search.
+        trial: what all trials have in common; each gets a name, a folder and further overrides.
+        searched: the keys that are searched.
+
+    Raises:
+        UserInputError: if Optuna is not installed.
+    """
+
+    def __init__(self, folder: Path, settings: SearchSettings, trial: Job, searched: Mapping[str, Searched]) -> None:
+        if importlib.util.find_spec("optuna") is None:
+            raise UserInputError("search needs optuna, which is not installed: pip install 'rcdsac-trl[search]'")
+        self.folder = folder
+        self.settings = settings
+        self.trial = trial
+        self.searched = searched
+
+    @cached_property
+    def study(self) -> "optuna.Study":
+        """Optuna's study, made or loaded."""
+        import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        settings = self.settings
+        self.folder.mkdir(parents=True, exist_ok=True)
+        journal = JournalFileBackend(str(self.folder / "optuna.journal"))
+        study = optuna.create_study(
+            study_name=settings.name,
+            storage=settings.storage or JournalStorage(journal),
+            direction="maximize",
+            load_if_exists=True,
+            pruner=optuna.pruners.MedianPruner(
+                n_startup_trials=settings.startup_trials,
+                n_warmup_steps=settings.warmup_iterations + 1,  # Optuna prunes at this step already
+                n_min_trials=_NEIGHBOURS,
+            ),
+        )
+        # What there is already counts in, else a search that goes on would draw its first trials once more.
+        seed = torch_seed(settings.seed, "search", len(study.get_trials(deepcopy=False)))
+        study.sampler = optuna.samplers.TPESampler(seed=seed % 2**32, n_startup_trials=settings.startup_trials)
+        return study
+
+    def run(self) -> None:
+        """Try until there are as many trials as asked for; then tell the best one."""
+        while (done := len(self._done())) < self.settings.trials:
+            self._take_up_what_was_lost()
+            trial = self.study.ask()
+            state = self._try(trial)
+            value = self._tell(trial, state)
+            print(f"{done + 1}/{self.settings.trials} {self._described(trial, state, value)}", flush=True)
+            if state.name == "interrupted":
+                raise KeyboardInterrupt
+        self._conclude()
+
+    def _done(self) -> set[str]:
+        """Name the folders of the trials that need no more; a lost one shares its with the one that takes it up."""
+        trials = [t for t in self.study.get_trials(deepcopy=False) if _FOLDER in t.user_attrs]
+        open_ones = {t.user_attrs[_FOLDER] for t in trials if not t.state.is_finished()}
+        return {t.user_attrs[_FOLDER] for t in trials} - open_ones
+
+    def _take_up_what_was_lost(self) -> None:
+        """Put trials whose process is gone in line again, to go on in their folders."""
+        import optuna
+
+        for trial in self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
+            folder = trial.user_attrs.get(_FOLDER)
+            if folder is None or self._is_alive(self.folder / folder):
+                continue
+            self.study.enqueue_trial(trial.params, user_attrs={_FOLDER: folder})
+            self.study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+
+    @staticmethod
+    def _is_alive(folder: Path) -> bool:
+        if not folder.is_dir():
+            return False
+        try:
+            FolderLock(folder).close()
+        except UserInputError:
+            return True
+        return False
+
+    def _try(self, trial: "optuna.Trial") -> State:
+        overrides = [f"{key}={kind.suggest(trial, key)}" for key, kind in self.searched.items()]
+        if _FOLDER not in trial.user_attrs:
+            trial.set_user_attr(_FOLDER, f"trial-{trial.number:04d}")
+        name = trial.user_attrs[_FOLDER]
+        folder = (self.folder / name).absolute()
+        job = replace(self.trial, name=name, folder=folder, overrides=(*self.trial.overrides, *overrides))
+        reported: set[int] = set()
+
+        def is_hopeless() -> bool:
+            for iteration, value in self._values(job.folder).items():
+                if iteration not in reported:
+                    reported.add(iteration)
+                    trial.report(value, iteration)
+            return bool(reported) and trial.should_prune()
+
+        return execute(job, should_stop=is_hopeless)
+
+    def _values(self, folder: Path) -> dict[int, float]:
+        """Read what each validation of a run is worth, by iterations done."""
+        try:
+            rows = pd.read_csv(folder / "validation_episodes.csv").dropna(subset=["collisions", "reward"])
+        except (OSError, ValueError, KeyError):  # not there yet, or being written
+            return {}
+        worth = rows["reward"] - self.settings.collision_cost * rows["collisions"]
+        means = worth.groupby(rows["iteration"] + 1).mean()
+        return dict(zip(means.index.tolist(), means.tolist(), strict=True))
+
+    def _tell(self, trial: "optuna.Trial", state: State) -> float | None:
+        """Tell Optuna how a trial ended, unless it goes on later; return its value."""
+        import optuna
+
+        ends = {"stopped": optuna.trial.TrialState.PRUNED, "failed": optuna.trial.TrialState.FAIL}
+        if state.name in ends:
+            self.study.tell(trial, state=ends[state.name])
+        if state.name != "finished":
+            return None
+        values = self._values(self.folder / trial.user_attrs[_FOLDER])
+        last = [values[iteration] for iteration in sorted(values)][-self.settings.averaged_validations :]
+        value = sum(last) / len(last)
+        self.study.tell(trial, value)
+        return value
+
+    def _described(self, trial: "optuna.Trial", state: State, value: float | None) -> str:
+        told = f" ({state.sentence})" if state.sentence is not None else ""
+        ended = "pruned" if state.name == "stopped" else state.name
+        worth = "" if value is None else f" {value:.1f}"
+        return f"{ended}{worth} {trial.user_attrs[_FOLDER]}: {self._as_overrides(trial.params)}{told}"
+
+    @staticmethod
+    def _as_overrides(params: Mapping[str, object]) -> str:
+        return " ".join(f"{key}={value}" for key, value in params.items())
+
+    def _conclude(self) -> None:
+        import optuna
+
+        self.study.trials_dataframe().to_csv(self.folder / "trials.csv", index=False)
+        print(f"trials: {self.folder / 'trials.csv'}")
+        if not self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,)):
+            print("no trial was finished")
+            return
+        best = self.study.best_trial
+        print(f"best {best.value:.1f} {self.folder / best.user_attrs[_FOLDER]}")
+        print(f"python -m rcdsac_trl.train {' '.join(self.trial.overrides)} {self._as_overrides(best.params)}")

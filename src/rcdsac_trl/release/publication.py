@@ -1,0 +1,110 @@
+"""Agents that are shipped: small weights with a card, and the tables that say how they learnt and drive."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.deploy import Policy
+from rcdsac_trl.deploy.policy.weights import Weights, halved, packed
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.seeding import stream
+from rcdsac_trl.storage import atomic
+
+Describe = Callable[[Path], str]
+"""What a card says of an evaluation, whose folder it is given."""
+
+# What stays of a run, where it has it: enough for every table and figure of a report.
+_TABLES = ("config.yaml", "training_episodes.csv", "validation_episodes.csv", "csv/scalars/time/elapsed_s.csv")
+_EVALUATION = ("evaluation.json", "episodes.csv")
+# Steps over which half precision is compared with single.
+_STEPS = 200
+
+
+@dataclass(frozen=True)
+class Published:
+    """An agent that is about to be shipped.
+
+    Attributes:
+        run: folder of its run.
+        weights: of its agent.
+        evaluation: folder of the evaluation that its card quotes.
+    """
+
+    run: Path
+    weights: Weights
+    evaluation: Path
+
+
+@dataclass(frozen=True)
+class Publication:
+    """Agents by the names they get, and where they go.
+
+    Attributes:
+        agents: by name.
+        weights: folder that takes a folder of each.
+        results: likewise, of the tables.
+    """
+
+    agents: Mapping[str, Published]
+    weights: Path
+    results: Path
+
+    def run(self, describe: Describe) -> Iterator[str]:
+        """Write all of them, and yield a sentence on each."""
+        for name, agent in self.agents.items():
+            small = halved(agent.weights)
+            differs = _largest_difference(agent.weights, small)
+            stored = (
+                f"Stored in half precision, which changed its speeds by at most {differs:.1e} m/s in {_STEPS} steps.\n"
+            )
+            # The tables come first: who finds weights finds what is said of them.
+            evaluation = agent.evaluation.relative_to(agent.run)
+            for path in (*map(Path, _TABLES), *(evaluation / file for file in _EVALUATION)):
+                if (agent.run / path).is_file():
+                    target = self.results / name / path
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    atomic.write(target, (agent.run / path).read_bytes())
+            files = packed(small, half=True, results=f"{describe(agent.evaluation).strip()}\n\n{stored}")
+            (self.weights / name).mkdir(parents=True, exist_ok=True)
+            for file, content in files.items():
+                atomic.write(self.weights / name / file, content)
+            size = sum(map(len, files.values()))
+            yield f"{name}: {size / 1e6:.1f} MB; half precision changes its speeds by at most {differs:.1e} m/s"
+
+
+def evaluation_of(run: Path, checkpoint: Name) -> Path:
+    """Return the evaluation of a run that is published: of that checkpoint, on evaluation maps, with most episodes.
+
+    Raises:
+        UserInputError: if there is none.
+    """
+    found = {}
+    for path in sorted(run.glob("evaluation/*/evaluation.json")):
+        told = json.loads(path.read_bytes())
+        if told["checkpoint"] == checkpoint and told["split"] == "evaluation" and not told.get("controller"):
+            found[path.parent] = told["num_maps"] * told["num_episodes"]
+    if not found:
+        raise UserInputError(
+            f"{run} has no evaluation of its checkpoint {checkpoint}: "
+            f"python -m rcdsac_trl.evaluate run={run} checkpoint={checkpoint}"
+        )
+    return max(found, key=lambda folder: found[folder])
+
+
+def _largest_difference(one: Weights, other: Weights) -> float:
+    """Return how far the speeds differ at most, m/s, that two agents want where they see the same."""
+    rng = stream(0, "publish")
+    policies = [Policy(weights, guard=None) for weights in (one, other)]
+    largest = 0.0
+    for _ in range(_STEPS):
+        ranges = rng.uniform(0.3, 6.0, NUM_BINS)
+        waypoints = rng.uniform(-3.0, 3.0, (2, 2))
+        velocity = rng.uniform((-0.2, -1.5), (0.6, 1.5))
+        wanted = [policy.act(ranges, waypoints, velocity).wanted for policy in policies]
+        assert wanted[0] is not None
+        assert wanted[1] is not None
+        largest = max(largest, abs(wanted[0][0] - wanted[1][0]))
+    return largest

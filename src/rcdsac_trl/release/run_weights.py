@@ -1,0 +1,105 @@
+"""The agent of a run as weights to deploy."""
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.run_config import CHECKPOINTS, AgentOfRun, agent_of_run
+from rcdsac_trl.deploy.policy.weights import AgentConfig, Context, Weights
+from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
+from rcdsac_trl.storage.checkpoint import load_states
+from rcdsac_trl.storage.checkpoint_record import Progress
+
+# Where the parts lie in a checkpoint: in the running average of the actor, and in the loss.
+_ACTOR = "module.module.{}.module."
+_CRITIC = "critic_network_params.{}.module.{}.module."
+_PARTS = ("encoder", "head")
+
+
+def weights_of_run(folder: Path, checkpoint: Name) -> Weights:
+    """Read the agent of a run: the averaged actor, which is what evaluations drive, and the critics.
+
+    Args:
+        folder: of the run.
+        checkpoint: ``"best"``, ``"last"``, or the iterations done.
+
+    Raises:
+        UserInputError: if there is no such run or checkpoint, or its weights do not fit its config.
+    """
+    agent = agent_of_run(folder)
+    saved, states, damaged = load_states(folder / CHECKPOINTS, checkpoint)
+    for sentence in damaged:
+        print(f"rcdsac_trl: {sentence}", file=sys.stderr)
+    tensors: dict[str, Tensor] = {}
+    for number, part in enumerate(_PARTS):
+        tensors |= _below(states["average"], _ACTOR.format(number), f"actor.{part}.")
+    num_critics = 0
+    while head := _below(states["loss"], _CRITIC.format(num_critics, 1), f"critics.{num_critics}.head."):
+        encoder = _below(states["loss"], _CRITIC.format(num_critics, 0), f"critics.{num_critics}.encoder.")
+        tensors |= encoder | head
+        num_critics += 1
+    config = _config(agent, num_critics, _provenance(folder, checkpoint, saved.progress))
+    return Weights(config, {name: np.ascontiguousarray(tensor.numpy()) for name, tensor in tensors.items()})
+
+
+def _below(state: Mapping[str, Tensor], prefix: str, new: str) -> dict[str, Tensor]:
+    """Return what lies below a prefix under another; the cosines' frequencies are no weights."""
+    found = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    return {new + name: value for name, value in found.items() if not name.startswith("cosines.")}
+
+
+def _config(agent: AgentOfRun, num_critics: int, provenance: dict[str, str | int | float | None]) -> AgentConfig:
+    algo, task = agent.algo, agent.task
+    context: Context | None = None
+    context_range = None
+    if (measure := algo.network_measure) is not None:
+        context, context_range = "beta", (measure.low, measure.high)
+    elif algo.collision_weight is not None:
+        context, context_range = "collision_weight", algo.collision_weight
+    return AgentConfig(
+        name=algo.name,
+        sensor=agent.sensor.name,
+        critic=algo.critic,
+        num_critics=num_critics,
+        context=context,
+        context_range=context_range,
+        measure=algo.distortion.name,
+        embedding=None if measure is None else _embedding(measure),
+        fixed_beta=algo.beta,
+        network=vars(agent.network),
+        period_s=(min(task.motor_steps) * MOTOR_PERIOD_S, max(task.motor_steps) * MOTOR_PERIOD_S),
+        waypoint_radius_m=task.waypoint_radius_m,
+        goal_radius_m=task.goal_radius_m,
+        provenance=provenance,
+    )
+
+
+def _embedding(measure: RiskMeasure) -> tuple[float, float]:
+    """Return slope and offset of a measure's embedding, which is linear for all of them."""
+    offset = measure.embed(0.0)
+    slope = measure.embed(1.0) - offset
+    for beta in (measure.low, measure.high):
+        if abs(slope * beta + offset - measure.embed(beta)) > 1e-12:
+            raise NotImplementedError(f"the embedding of measure {measure.name!r} is not linear: weights hold a line")
+    return slope, offset
+
+
+def _provenance(folder: Path, checkpoint: Name, progress: Progress) -> dict[str, str | int | float | None]:
+    manifest = {}
+    if (path := folder / "manifest.json").is_file():
+        manifest = json.loads(path.read_bytes())
+    return {
+        "commit": manifest.get("commit"),
+        "seed": manifest.get("seed"),
+        "checkpoint": checkpoint,
+        "iterations": progress.iterations,
+        "agent_steps": progress.steps,
+        "updates": progress.updates,
+        "validation_score": progress.best_score if checkpoint == "best" else None,
+    }

@@ -1,0 +1,108 @@
+"""What an agent is told: range bins and waypoints (paper, section "States and Observations").
+
+Pure functions; the simulated world and the policy on a robot call the same ones, so that what an agent sees there is
+what it was trained on.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M
+
+# Observations (paper, section "States and Observations").
+MIN_RANGE_M = 0.01
+"""Ranges are seen strictly between this and :data:`MAX_RANGE_M`."""
+
+
+RANGE_OFFSET = 2.5
+"""What is added to log10 of the distance, so that 0 can mean "nothing there"."""
+
+
+MAX_RANGE_OBSERVATION = RANGE_OFFSET + math.log10(MAX_RANGE_M)
+"""Upper limit of a range observation."""
+
+
+WAYPOINT_DISTANCE_LIMITS_M = (0.01, 100.0)
+
+
+Point = tuple[float, float]
+"""x and y in the map frame, m."""
+
+
+def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float32]:
+    """Return o_rng: 2.5 + log10 of the distance, 0 where nothing is within (0.01, 3) m or the mask is false.
+
+    Args:
+        distances: [..., 180], m; ``inf`` where nothing is.
+        mask: bool [180], the bins the sensor has; see :func:`sensor_mask`.
+
+    Returns:
+        float32 [..., 180].
+
+    Example:
+        >>> range_observation([1.0, 0.1, 3.0], [True, True, True]).tolist()
+        [2.5, 1.5, 0.0]
+    """
+    d = np.asarray(distances, dtype=np.float64)
+    observed = np.zeros(d.shape, dtype=np.float32)
+    seen = (d > MIN_RANGE_M) & (d < MAX_RANGE_M) & np.asarray(mask, dtype=np.bool_)
+    # Of the logarithms, the expensive part, only those that are seen.
+    observed[seen] = RANGE_OFFSET + np.log10(d[seen])
+    return observed
+
+
+def range_distances(observed: ArrayLike) -> NDArray[np.float64]:
+    """Return the distances of range observations, m; ``inf`` where nothing was seen. Undoes :func:`range_observation`.
+
+    Args:
+        observed: o_rng, [..., 180].
+
+    Example:
+        >>> range_distances([2.5, 1.5, 0.0]).tolist()
+        [1.0, 0.1, inf]
+    """
+    o = np.asarray(observed, dtype=np.float64)
+    return np.where(o > 0.0, 10.0 ** (o - RANGE_OFFSET), np.inf)
+
+
+def waypoint_observation(pose: tuple[float, float, float], waypoint_1: Point, waypoint_2: Point) -> tuple[float, ...]:
+    """Return o_waypoint: log10 of the distance, cosine and sine of the bearing, of the next two waypoints.
+
+    Args:
+        pose: the robot's x, y in m and yaw in rad, map frame.
+        waypoint_1: the next waypoint, map frame, m.
+        waypoint_2: the one after it; on the last leg both are the goal.
+
+    Returns:
+        Six numbers; distances are clipped to [0.01, 100] m before the logarithm.
+
+    Example:
+        >>> observed = waypoint_observation((0.0, 0.0, 0.0), (10.0, 0.0), (0.0, 100.0))
+        >>> [round(value, 6) for value in observed]
+        [1.0, 1.0, 0.0, 2.0, 0.0, 1.0]
+    """
+    low, high = WAYPOINT_DISTANCE_LIMITS_M
+    distance_1, bearing_1 = distance_and_bearing(pose, waypoint_1)
+    distance_2, bearing_2 = distance_and_bearing(pose, waypoint_2)
+    return (
+        math.log10(min(max(distance_1, low), high)),
+        math.cos(bearing_1),
+        math.sin(bearing_1),
+        math.log10(min(max(distance_2, low), high)),
+        math.cos(bearing_2),
+        math.sin(bearing_2),
+    )
+
+
+def distance_and_bearing(pose: tuple[float, float, float], point: Point) -> tuple[float, float]:
+    """Return the distance to a point in m and its angle from the robot's x axis in rad, any full turns apart.
+
+    Args:
+        pose: the robot's x, y in m and yaw in rad, map frame.
+        point: map frame, m.
+    """
+    x, y, yaw = pose
+    dx, dy = point[0] - x, point[1] - y
+    return math.hypot(dx, dy), math.atan2(dy, dx) - yaw

@@ -1,0 +1,147 @@
+"""Environments and teams with everything a policy reads."""
+
+from collections.abc import Sequence
+
+from torchrl.envs import EnvBase, InitTracker, StepCounter, TransformedEnv
+
+from rcdsac_trl.agent.actor import recurrent_state_primer
+from rcdsac_trl.agent.transforms import EpisodeSampler
+from rcdsac_trl.config.algo_settings import AlgoSettings
+from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.rollout.worker import Team
+from rcdsac_trl.world.maps.generator import Split
+from rcdsac_trl.world.task.env import NavigationEnv, make_env
+from rcdsac_trl.world.task.world_settings import WorldSettings
+
+
+def environment(
+    world: WorldSettings,
+    algo: AlgoSettings | None,
+    *,
+    split: Split,
+    seed: int,
+    agent_ids: Sequence[int],
+    memory: int,
+    conditions: Sequence[Condition] | None = None,
+    first_episode: int = 0,
+) -> EnvBase:
+    """Make an environment with everything a policy reads.
+
+    Args:
+        world: what it is made of.
+        algo: what the agents are told; None for a baseline, which is told nothing.
+        split: training, validation or evaluation maps.
+        seed: root seed of maps, starts, goals, movers and of what the agents are told.
+        agent_ids: numbers of the agents; equal numbers meet the same starts and goals.
+        memory: size of the policy's recurrent state.
+        conditions: tell agent i ``conditions[i]``; None draws what they are told an episode.
+        first_episode: number of each agent's first episode.
+    """
+    base = make_env(
+        world.map_settings,
+        world.task,
+        sensor=world.sensor,
+        split=split,
+        seed=seed,
+        agent_ids=agent_ids,
+        num_workers=world.num_workers,
+        first_episode=first_episode,
+        weighted_collisions=_is_weighted(algo),
+        worker_timeout_s=world.worker_timeout_s,
+        gui=world.gui,
+    )
+    env = TransformedEnv(base)
+    env.append_transform(InitTracker())
+    env.append_transform(StepCounter(max_steps=world.task.episode_steps))
+    env.append_transform(recurrent_state_primer(memory))
+    told = _told(algo, seed, agent_ids, conditions, first_episode)
+    if told is not None:
+        env.append_transform(told)
+    return env
+
+
+def team(
+    world: WorldSettings,
+    algo: AlgoSettings | None,
+    *,
+    split: Split,
+    seed: int,
+    agent_ids: Sequence[int],
+    memory: int,
+    conditions: Sequence[Condition] | None = None,
+) -> Team:
+    """Make agents of this process that drive whole episodes; arguments as for :func:`environment`."""
+    env = NavigationEnv(
+        world.map_settings,
+        world.task,
+        sensor=world.sensor,
+        split=split,
+        seed=seed,
+        agent_ids=agent_ids,
+        weighted_collisions=_is_weighted(algo),
+        gui=world.gui,
+    )
+    told = _told(algo, seed, agent_ids, conditions, 0)
+    return Team(env, told, memory=memory, steps=world.task.episode_steps)
+
+
+def _is_weighted(algo: AlgoSettings | None) -> bool:
+    return algo is not None and algo.collision_weight is not None
+
+
+def _told(
+    algo: AlgoSettings | None,
+    seed: int,
+    agent_ids: Sequence[int],
+    conditions: Sequence[Condition] | None,
+    first_episode: int,
+) -> EpisodeSampler | None:
+    """Make what tells the agents their beta or collision weight; None where they are told nothing."""
+    if algo is None or algo.context_key is None:
+        return None
+    fixed: list[float] | None = None
+    if algo.collision_weight is not None:
+        low, high = algo.collision_weight
+        if conditions is not None:
+            fixed = [c.collision_weight for c in conditions if c.collision_weight is not None]
+        return EpisodeSampler(
+            "collision_weight",
+            lambda u: low + (high - low) * u,
+            seed=seed,
+            agent_ids=agent_ids,
+            first_episode=first_episode,
+            fixed=fixed,
+        )
+    measure = algo.distortion.measure
+    if conditions is not None:
+        # A controller tells its agents at every step; they must be told something before.
+        fixed = [measure.low if c.beta is None else c.beta for c in conditions if c.beta is not None or c.controller]
+    return EpisodeSampler(
+        "risk",
+        measure.from_uniform,
+        seed=seed,
+        agent_ids=agent_ids,
+        first_episode=first_episode,
+        fixed=fixed,
+    )
+
+
+def evaluation_team(
+    world: WorldSettings,
+    algo: AlgoSettings | None,
+    conditions: Sequence[Condition],
+    split: Split,
+    seed: int,
+    num_agents: int,
+    memory: int,
+) -> Team:
+    """Make a team in which a block of agents drives under each condition, side by side on the same map."""
+    return team(
+        world,
+        algo,
+        split=split,
+        seed=seed,
+        agent_ids=list(range(num_agents)) * len(conditions),
+        memory=memory,
+        conditions=[condition for condition in conditions for _ in range(num_agents)],
+    )

@@ -1,0 +1,108 @@
+"""The episodes that are trained on, iteration after iteration; what drives them is made anew after a fault."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+
+from rcdsac_trl.rollout.worker_processes import Request, Teams
+from rcdsac_trl.system.processes import WorkerError
+
+
+class Episodes(Protocol):
+    """Collects the episodes of one iteration after another."""
+
+    def collect(self, iteration: int, map_index: int) -> TensorDictBase:
+        """Return the episodes of an iteration, ``[N, T]``, with at least what the replay and the metrics read.
+
+        Args:
+            iteration: the next one, or the one that failed.
+            map_index: the next map, or after a fault the one to go on with.
+
+        Raises:
+            WorkerError: if a worker process died or hung; what was driven on this map is lost.
+        """
+
+    def close(self) -> None:
+        """End the worker processes, and bear that they may be gone: it must not hide why training ends."""
+
+
+class TeamEpisodes:
+    """Has whole episodes driven by teams, each with a copy of the actor that comes with every request.
+
+    Args:
+        make: makes the teams.
+        weights: packs the actor's weights as they are now.
+    """
+
+    def __init__(self, make: Callable[[], Teams], weights: Callable[[], bytes]) -> None:
+        self._make = make
+        self._weights = weights
+        self._teams: Teams | None = make()
+
+    def collect(self, iteration: int, map_index: int) -> TensorDictBase:
+        """See :class:`Episodes`."""
+        try:
+            if self._teams is None:
+                self._teams = self._make()
+            return self._teams.ask(Request(iteration, map_index, self._weights()))
+        except WorkerError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """See :class:`Episodes`."""
+        if self._teams is not None:
+            self._teams.close()
+        self._teams = None
+
+
+class CollectorEpisodes:
+    """Takes the episodes from one of TorchRL's collectors.
+
+    Args:
+        make: makes a collector from an iteration and the number of its map; it yields ``[..., T]``, the episodes of
+            that iteration, then of the next one on the next map, to the end of the schedule.
+        set_iteration: told the iteration whose episodes are about to be collected.
+        iteration: the first one.
+        map_index: the number of its map.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int, int], Collector],
+        set_iteration: Callable[[int], None],
+        *,
+        iteration: int,
+        map_index: int,
+    ) -> None:
+        self._make = make
+        self._set_iteration = set_iteration
+        self._collector: Collector | None = None
+        self._batches: Iterator[TensorDictBase] = iter(())
+        self._start(iteration, map_index)
+
+    def collect(self, iteration: int, map_index: int) -> TensorDictBase:
+        """See :class:`Episodes`."""
+        try:
+            if self._collector is None:
+                self._start(iteration, map_index)
+            self._set_iteration(iteration)
+            batch = next(self._batches)
+        except WorkerError:
+            self.close()
+            raise
+        return batch.reshape(-1, batch.shape[-1])
+
+    def _start(self, iteration: int, map_index: int) -> None:
+        self._collector = self._make(iteration, map_index)
+        self._batches = iter(self._collector)
+
+    def close(self) -> None:
+        """See :class:`Episodes`."""
+        if self._collector is not None:
+            with contextlib.suppress(Exception):
+                self._collector.shutdown(raise_on_error=False)
+        self._collector = None

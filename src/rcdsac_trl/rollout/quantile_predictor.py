@@ -1,0 +1,59 @@
+"""What the critics say of the actions that agents take, step after step."""
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+
+from rcdsac_trl.deploy.policy.policy import fractions_of
+
+NUM_QUANTILES = 16
+"""Quantiles that are read of a prediction; a :class:`rcdsac_trl.deploy.Policy` tells as many."""
+
+
+class QuantilePredictor:
+    """Predicts the return of some agents of a team as a robot does: the critics look back to the episode's start, and
+    the lower one counts at each fraction.
+
+    Args:
+        critics: an encoder and a quantile head each, from :func:`rcdsac_trl.agent.actor.build_critic`.
+        rows: the agents.
+        num_quantiles: at how many fractions, the midpoints of equal parts of [0, 1].
+
+    Attributes:
+        rows: the agents, ``[R]``.
+    """
+
+    def __init__(
+        self, critics: Sequence[TensorDictSequential], rows: Sequence[int], num_quantiles: int = NUM_QUANTILES
+    ) -> None:
+        self.rows = torch.tensor(list(rows))
+        self._critics = critics
+        self._tau = torch.from_numpy(fractions_of(num_quantiles)).expand(len(rows), 1, -1)
+        self._memories = [torch.zeros(len(rows), critic[0].module.memory_size) for critic in critics]
+
+    def step(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the quantiles ``[R, N]`` of each agent's return from its action on.
+
+        Args:
+            tensordict: ``[N]``, the observations, `is_init`, `action`, and `risk` where the critics read it. Call it
+                for every step of an episode.
+        """
+        lowest = None
+        with torch.no_grad():
+            for number, (encoder, head) in enumerate(self._critics):
+                seen = [tensordict[key][self.rows] for key in (*encoder.in_keys, "is_init")]
+                memory = self._memories[number] = encoder.module.step(*seen, self._memories[number])
+                entries = {
+                    head.in_keys[0]: memory.unsqueeze(1),
+                    "action": tensordict["action"][self.rows].unsqueeze(1),
+                    "tau": self._tau,
+                }
+                if "risk" in head.in_keys:
+                    entries["risk"] = tensordict["risk"][self.rows].unsqueeze(1)
+                told = head.module(*[entries[key] for key in head.in_keys])[:, 0]
+                lowest = told if lowest is None else torch.minimum(lowest, told)
+        assert lowest is not None
+        return lowest

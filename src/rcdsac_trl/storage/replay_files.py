@@ -1,0 +1,99 @@
+"""The replay on disk: every episode is written once, into a file that never changes."""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import safetensors.torch
+from tensordict import TensorDict
+
+from rcdsac_trl.storage import atomic
+from rcdsac_trl.storage.replay import SequenceReplay
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One file of consecutive episodes.
+
+    Attributes:
+        file: its name in the folder.
+        sha256: of its content.
+        first_episode: number of its first episode, counted from 0 as the replay does.
+        episodes: how many it holds.
+    """
+
+    file: str
+    sha256: str
+    first_episode: int
+    episodes: int
+
+    @property
+    def end(self) -> int:
+        """Number of the first episode behind it."""
+        return self.first_episode + self.episodes
+
+
+class ReplayFiles:
+    """Keeps the episodes of a replay in files, as compact as in memory (safetensors, nothing to unpickle).
+
+    Args:
+        folder: where the files go; made at the first :meth:`save`.
+        replay: whose episodes they are.
+    """
+
+    def __init__(self, folder: Path, replay: SequenceReplay) -> None:
+        self.folder = folder
+        self.replay = replay
+        self._segments: list[Segment] = []
+
+    def save(self) -> list[Segment]:
+        """Write the episodes that are in no file yet; what it costs depends on their number alone.
+
+        Returns:
+            The segments that together hold the replay, the oldest first. The oldest may begin with episodes that
+            have left the replay.
+        """
+        oldest = self.replay.oldest_episode
+        self._segments = [segment for segment in self._segments if segment.end > oldest]
+        first = max(oldest, self._segments[-1].end if self._segments else 0)
+        if first < self.replay.episodes_added:
+            self._segments.append(self._write(first, self.replay.episodes_added - first))
+        return list(self._segments)
+
+    def _write(self, first: int, episodes: int) -> Segment:
+        stored = self.replay.stored_episodes(first, episodes)
+        content = safetensors.torch.save({key: value.contiguous() for key, value in stored.items()})
+        self.folder.mkdir(exist_ok=True)
+        file = f"episodes-{first:08d}.safetensors"
+        atomic.write(self.folder / file, content)
+        return Segment(file, sha256(content).hexdigest(), first, episodes)
+
+    def load(self, segments: Sequence[Segment]) -> None:
+        """Fill the empty replay with segments that :func:`damage` found whole."""
+        if not segments:
+            return
+        oldest = max(segments[0].first_episode, segments[-1].end - self.replay.capacity_episodes)
+        self.replay.restore(oldest, self._read(segments, oldest))
+        self._segments = list(segments)
+
+    def _read(self, segments: Sequence[Segment], oldest: int) -> Iterator[TensorDict]:
+        for segment in segments:
+            tensors = safetensors.torch.load_file(self.folder / segment.file)
+            stored = TensorDict(tensors, batch_size=[segment.episodes, self.replay.episode_steps + 1])
+            yield stored[max(0, oldest - segment.first_episode) :]
+
+
+def remove_others(folder: Path, kept: Collection[str]) -> None:
+    """Remove the files of a replay's folder that have none of these names."""
+    for path in folder.glob("*.safetensors"):
+        if path.name not in kept:
+            path.unlink()
+
+
+def damage(folder: Path, segments: Sequence[Segment]) -> str | None:
+    """Say what is wrong with the files of some segments; None if they are whole."""
+    for segment in segments:
+        if (reason := atomic.damage(folder / segment.file, segment.sha256)) is not None:
+            return f"{folder / segment.file} {reason}"
+    return None

@@ -1,0 +1,101 @@
+"""What the process itself needs: an allocator that keeps its pages, a device and threads.
+
+This module is imported before torch, so that a re-executed process has paid nothing twice.
+"""
+
+import os
+import re
+import sys
+from contextlib import suppress
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system.cores import usable_cores
+
+# glibc maps and unmaps every large temporary by default, which costs more than the arithmetic on it.
+_GLIBC_KEEPS_PAGES = {
+    "MALLOC_MMAP_MAX_": "0",
+    "MALLOC_TRIM_THRESHOLD_": str(1 << 40),
+    "MALLOC_TOP_PAD_": str(1 << 26),
+}
+# From some such number on the libraries that start them die instead of refusing.
+_MAX_THREADS = 1024
+
+
+def keep_pages() -> None:
+    """Start this process again with an allocator that keeps its pages, once, where the C library is glibc.
+
+    The settings only work from a process's first moment. A user who has set one of them, or preloads another
+    allocator, is left alone. Where the process cannot be started again it goes on as it is.
+    """
+    if not _has_glibc() or "LD_PRELOAD" in os.environ or not sys.executable:
+        return
+    if any(name in os.environ for name in _GLIBC_KEEPS_PAGES):
+        return
+    with suppress(OSError):
+        os.execve(sys.executable, sys.orig_argv, os.environ | _GLIBC_KEEPS_PAGES)
+
+
+def _has_glibc() -> bool:
+    """Return whether the C library is glibc: no other knows its version's name."""
+    try:
+        return bool(os.confstr("CS_GNU_LIBC_VERSION"))
+    except (AttributeError, OSError, ValueError):
+        return False
+
+
+def quiet_libraries() -> None:
+    """Keep TorchRL's own notes (every storage it makes) out of the user's log, unless they ask for them."""
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+
+def allocator() -> str:
+    """Name the allocator's state for the log."""
+    if "LD_PRELOAD" in os.environ:
+        return f"preloaded ({os.environ['LD_PRELOAD']})"
+    given = {name: os.environ[name] for name in _GLIBC_KEEPS_PAGES if name in os.environ}
+    if not given or not _has_glibc():
+        return "the system's default"
+    if given == _GLIBC_KEEPS_PAGES:
+        return "glibc that keeps its pages"
+    return f"glibc with {', '.join(f'{name}={value}' for name, value in given.items())}"
+
+
+def resolve_device(name: str) -> str:
+    """Turn ``auto`` into CUDA where there is one, else the CPU.
+
+    Raises:
+        UserInputError: if the named device is not on this machine.
+    """
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+        raise UserInputError(f"device={name} is not supported: use auto, cpu, cuda or cuda:<number>")
+    if name != "cpu" and (torch.device(name).index or 0) >= torch.cuda.device_count():
+        raise UserInputError(f"device={name}, but torch does not see it here: use device=auto or device=cpu")
+    return name
+
+
+def resolve_threads(threads: int | str) -> int:
+    """Turn ``auto`` into the cores this process may use.
+
+    Raises:
+        UserInputError: if there is no such number of threads.
+    """
+    if threads == "auto":
+        return usable_cores()
+    if not isinstance(threads, int) or threads < 1:
+        raise UserInputError(f"threads={threads} is not a whole number of at least 1: use that or auto")
+    if threads > _MAX_THREADS:
+        raise UserInputError(f"threads={threads} is above {_MAX_THREADS}: use as many as there are cores, or auto")
+    return threads
+
+
+def set_threads(threads: int | str) -> int:
+    """Set how many threads torch uses for one operation, see :func:`resolve_threads`, and return the number."""
+    import torch
+
+    number = resolve_threads(threads)
+    torch.set_num_threads(number)
+    return number

@@ -1,0 +1,290 @@
+"""A training run from its config."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from tensordict import TensorDict
+from torchrl.objectives import LossModule, SoftUpdate
+
+from rcdsac_trl.agent.kernels import matmul
+from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
+from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_run, training_settings
+from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.rollout.make_agent import make_average, make_loss, make_optimizer, make_relabel, packed, parameters
+from rcdsac_trl.rollout.make_collector import check_collector, make_episodes
+from rcdsac_trl.rollout.map_evaluator import Course, driver
+from rcdsac_trl.storage.atomic import FolderLock
+from rcdsac_trl.storage.checkpoint import Checkpoints, Generators, load_average, rotate
+from rcdsac_trl.storage.checkpoint_record import DamagedError, Progress, Saved, best_damage, folder_name, newest
+from rcdsac_trl.storage.replay import SequenceReplay, replay_bytes
+from rcdsac_trl.storage.replay_files import ReplayFiles
+from rcdsac_trl.system import resources, runtime
+from rcdsac_trl.system.cores import usable_cores
+from rcdsac_trl.system.processes import resolve_processes_beside
+from rcdsac_trl.training import run_log
+from rcdsac_trl.training.learner import Learner
+from rcdsac_trl.training.nan_guard import FiniteGuard, load_failure
+from rcdsac_trl.training.trainer import Trainer
+from rcdsac_trl.training.validation import Snapshot, Validation
+from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
+
+# Validation looks at the same maps whatever seed a run is trained with.
+VALIDATION_SEED = 0
+REPLAY = "replay"
+
+
+def run_folder() -> Path:
+    """Return the folder Hydra made for this job."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def given_overrides() -> list[str]:
+    """Return the overrides Hydra was given for this job, without those of Hydra itself."""
+    return list(HydraConfig.get().overrides.task)
+
+
+def check_training(cfg: DictConfig) -> None:
+    """Read everything, so that what cannot work is refused before anything is written."""
+    settings = training_settings(cfg)
+    runtime.resolve_device(settings.device)
+    run_log.check_backends(settings.logger.backends)
+    check_collector(settings)
+    _check_memory(settings)
+
+
+def _check_memory(settings: TrainingSettings) -> None:
+    """Refuse what surely does not fit; of a mini-batch its range observations alone are counted."""
+    learner, others = settings.learner, "or end other programs"
+    resources.check_memory("the replay", _replay_bytes(settings), f"lower replay.capacity_steps, {others}")
+    observations = learner.batch_size * (learner.sequence_length + 1)
+    batch_bytes = observations * sensor_mask(settings.sensor.name).size * torch.float32.itemsize
+    resources.check_memory("a mini-batch", batch_bytes, f"lower learner.batch_size, {others}")
+    # Those of the training stay while a map is validated.
+    simulations = settings.world.num_agents * (1 + len(settings.algo.default_conditions))
+    needed_bytes = simulations * SIMULATION_BYTES
+    resources.check_memory(f"{simulations} simulations", needed_bytes, f"lower world.num_agents, {others}")
+
+
+def _replay_bytes(settings: TrainingSettings) -> int:
+    algo = settings.algo
+    keys = (algo.context_key,) if algo.context_key is not None else ()
+    bins = int(sensor_mask(settings.sensor.name).sum())
+    return replay_bytes(settings.replay_steps, settings.task.episode_steps, bins, keys)
+
+
+def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
+    """Make the replay, no larger than the run can fill."""
+    algo = settings.algo
+    return SequenceReplay(
+        capacity_steps=settings.replay_steps,
+        episode_steps=settings.task.episode_steps,
+        sequence_length=settings.learner.sequence_length,
+        batch_size=settings.learner.batch_size,
+        sensor_mask=torch.from_numpy(sensor_mask(settings.sensor.name)),
+        context_keys=(algo.context_key,) if algo.context_key is not None else (),
+        seed=settings.seed,
+        device=device,
+    )
+
+
+def make_learner(settings: TrainingSettings, device: str) -> Learner:
+    """Make the networks and all that updates them, with an empty replay."""
+    loss = make_loss(settings, device)
+    return Learner(
+        replay=make_replay(settings, device),
+        loss=loss,
+        relabel=make_relabel(settings, device),
+        optimizer=make_optimizer(loss, settings.learner),
+        targets=FusedSoftUpdate(loss, tau=settings.learner.target_coefficient),
+        clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],
+        max_grad_norm=settings.learner.max_grad_norm,
+        average=make_average(loss, settings.learner),
+    )
+
+
+def make_trainer(cfg: DictConfig, folder: Path, overrides: Sequence[str] = ()) -> Trainer:
+    """Make a new training run that writes into a folder.
+
+    Args:
+        cfg: of the run.
+        folder: made if it is not there.
+        overrides: that made the config; noted for whoever continues the run.
+
+    Raises:
+        UserInputError: if another process trains in the folder, or it holds a run.
+    """
+    settings = training_settings(cfg)
+    facts = {
+        "overrides": list(overrides),
+        "device": runtime.resolve_device(settings.device),
+        "threads": runtime.resolve_threads(settings.threads),
+        "allocator": runtime.allocator(),
+        "matrix_products": matmul.LIBRARY,
+    }
+    run_log.check_folder(folder)
+    learner = _learner_here(settings)  # before anything is written: it may not fit into the memory
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FolderLock(folder)
+    try:
+        run_log.start_run_folder(folder, cfg, facts)
+        return _assemble(settings, learner, folder, lock, None, [])
+    except BaseException:
+        lock.close()
+        raise
+
+
+def resume_training(folder: Path) -> Trainer | None:
+    """Make the trainer that continues a run in its folder, as its config says; None if the run is finished.
+
+    Raises:
+        UserInputError: if another process trains in it, or it has checkpoints and none is whole.
+    """
+    settings = settings_of_run(folder, key="resume")
+    resources.check_writable(folder)
+    check_collector(settings)
+    _check_memory(settings)
+    lock = FolderLock(folder)
+    try:
+        saved, damaged = newest(folder / CHECKPOINTS, replay=folder / REPLAY) if has_begun(folder) else (None, [])
+        if saved is not None and saved.progress.iterations == settings.schedule.iterations:
+            if not damaged:  # it may have died after its last checkpoint, before what is then too old was removed
+                rotate(folder / CHECKPOINTS, keep=settings.checkpoint.keep, replay=folder / REPLAY)
+            lock.close()
+            return None
+        return _assemble(settings, _learner_here(settings), folder, lock, saved, damaged)
+    except BaseException:
+        lock.close()
+        raise
+
+
+def reproduce_failure(dump: Path) -> tuple[LossModule, TensorDict]:
+    """Make what shows a NaN or an infinity again: called with the batch, the loss returns what it returned then.
+
+    Args:
+        dump: a folder below ``failure/`` of a run folder.
+    """
+    settings = settings_of_run(dump.parents[1])
+    loss = make_loss(settings, "cpu")
+    SoftUpdate(loss, tau=settings.learner.target_coefficient)  # TorchRL warns of targets that nothing moves
+    return loss, load_failure(dump, loss)
+
+
+def has_begun(folder: Path) -> bool:
+    """Whether a run has saved or driven anything; one that has not can only be begun."""
+    return (folder / run_log.TRAINING_TABLE).exists() or any((folder / CHECKPOINTS).glob("[!.]*"))
+
+
+def _learner_here(settings: TrainingSettings) -> Learner:
+    """Make the learner with the threads and on the device that this machine gives the run."""
+    runtime.set_threads(settings.threads)
+    return make_learner(settings, runtime.resolve_device(settings.device))
+
+
+def _assemble(
+    settings: TrainingSettings, learner: Learner, folder: Path, lock: FolderLock, saved: Saved | None, told: list[str]
+) -> Trainer:
+    device, threads = runtime.resolve_device(settings.device), runtime.resolve_threads(settings.threads)
+    loss, average, optimizer, relabel = learner.loss, learner.average, learner.optimizer, learner.relabel
+    generators = {"replay": learner.replay.generator}
+    if relabel is not None and relabel.generator is not None:
+        generators["relabel"] = relabel.generator
+    checkpoints = Checkpoints(
+        folder / CHECKPOINTS,
+        {"loss": loss, "average": average, "optimizer": optimizer, "generators": Generators(**generators)},
+        replay=ReplayFiles(folder / REPLAY, learner.replay),
+        keep=settings.checkpoint.keep,
+    )
+    written = sum(path.stat().st_size for path in (folder / REPLAY).glob("*"))
+    # Those that stay, the best, the one being validated, the one being written; a checkpoint doubles when the optimiser
+    # has its state.
+    checkpoints_bytes = 2 * checkpoints.size_bytes() * (settings.checkpoint.keep + 3)
+    shortage = resources.disk_shortage(folder, max(0, _replay_bytes(settings) - written) + checkpoints_bytes)
+    told = [*told, *([] if shortage is None else [shortage])]
+    progress, pending = Progress(), None
+    if saved is not None:
+        progress, more = _restore(folder, checkpoints, saved)
+        pending, progress, left_out = _pending(settings, checkpoints.folder, progress)
+        total = settings.schedule.iterations
+        told = [
+            *told,
+            *more,
+            *left_out,
+            f"continue after {progress.iterations} of {total} iterations, from {saved.path}",
+        ]
+    log = run_log.RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
+    active = f"allocator: {runtime.allocator()}, matrix products by {matmul.LIBRARY} BLAS"
+    for sentence in [*told, f"device {device}, {threads} threads, {active}"]:
+        log.message(sentence)
+    return Trainer(
+        schedule=settings.schedule,
+        progress=progress,
+        episodes=make_episodes(settings, loss.actor_network, device, progress),
+        learner=learner,
+        guard=FiniteGuard(folder, loss, optimizer),
+        validate=_validation(settings, device, threads),
+        validate_every=settings.validation.every_iterations,
+        pending=pending,
+        checkpoints=checkpoints,
+        checkpoint_every=settings.checkpoint.every_iterations,
+        log=log,
+        lock=lock,
+        max_restarts=settings.world.max_restarts,
+        context_key=settings.algo.context_key,
+    )
+
+
+def _restore(folder: Path, checkpoints: Checkpoints, saved: Saved) -> tuple[Progress, list[str]]:
+    """Bring components and logs back to a checkpoint; return the progress, and what the user should know."""
+    checkpoints.restore(saved)
+    told = run_log.cut(folder, saved.logs)
+    damage = best_damage(checkpoints.folder, saved.progress)
+    if damage is None:
+        return saved.progress, told
+    return replace(saved.progress, best_score=None, best_iterations=None), [*told, damage]
+
+
+def _pending(
+    settings: TrainingSettings, checkpoints: Path, progress: Progress
+) -> tuple[Snapshot | None, Progress, list[str]]:
+    """Load the agent whose validation was under way; without it that validation is left out, and the user told."""
+    if progress.validating_iterations is None:
+        return None, progress, []
+    path = checkpoints / folder_name(progress.validating_iterations)
+    average = make_average(make_loss(settings, "cpu"), settings.learner)
+    try:
+        then = load_average(path, average).progress
+    except DamagedError as error:
+        told = f"checkpoint {path} is damaged: {error}; its validation was under way and is left out"
+        return None, replace(progress, validating_iterations=None), [told]
+    return Snapshot(then, packed(average.module)), progress, []
+
+
+def _validation(settings: TrainingSettings, device: str, threads: int) -> Validation:
+    world, given = replace(settings.training_world, num_workers=0), settings.validation
+    course = Course(
+        trained=settings,
+        world=world,
+        conditions=settings.algo.default_conditions,
+        split="validation",
+        seed=VALIDATION_SEED,
+        num_episodes=world.num_agents,
+        sampled=False,
+        device=device,
+        threads=1,
+    )
+    beside = resolve_processes_beside(given.processes, given.num_maps, threads)
+    alone = min(usable_cores(), given.num_maps) if given.processes == "auto" else beside
+    return Validation(
+        partial(driver, course),
+        num_maps=given.num_maps,
+        steps=world.task.episode_steps,
+        processes=beside,
+        processes_alone=alone,
+        timeout_s=world.worker_timeout_s,
+    )

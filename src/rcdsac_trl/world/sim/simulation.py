@@ -1,0 +1,229 @@
+"""The physics: one robot among the obstacles of one map, in one PyBullet client.
+
+The world is seen from above: there is no floor and no gravity, walls and clutter are upright and higher than
+the robot, and the robot cannot roll or pitch, so all contact forces are horizontal. The robot is a dynamic
+body that is given its motor controller's velocities every 0.02 s; PyBullet moves it and lets contact take
+velocity away, and what is left is what the robot measures.
+"""
+
+import math
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import clip_command
+from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
+from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.world.maps.generator import Map
+from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
+from rcdsac_trl.world.sim import bodies
+from rcdsac_trl.world.sim.bullet import pybullet
+from rcdsac_trl.world.sim.lidar import scan
+from rcdsac_trl.world.sim.movers import Movers, WalkPlanner
+
+SIMULATION_BYTES = 28_000_000
+"""Memory that PyBullet takes for a simulation, however empty; where there is none left, it ends the process."""
+CONTACT_DISTANCE_M = 1e-3
+"""The robot is in contact with what is nearer than this.
+
+The solver lets a pushing robot rest within about 0.01 mm of a wall, on either side of it; with a limit of 0
+mm, leaning on a wall would read as a series of collisions.
+"""
+
+# Movers farther than this from touching the robot are moved in PyBullet only once an agent step, in which
+# both together go at most 0.2 m.
+_MOVER_SYNC_GAP_M = 0.5
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+# Added to how far the robot and a mover can come nearer to each other, for what rounding and contact add.
+_SLACK_M = 0.02
+
+
+class StepResult(NamedTuple):
+    """What one agent step did.
+
+    Attributes:
+        pose: x, y in m and yaw in [-pi, pi] rad, map frame.
+        v_c: linear velocity along the robot's x axis, measured after contact, m/s.
+        omega_c: angular velocity, measured after contact, rad/s.
+        in_contact: whether the robot touched anything in any of the motor steps.
+    """
+
+    pose: tuple[float, float, float]
+    v_c: float
+    omega_c: float
+    in_contact: bool
+
+
+class Simulation:
+    """One robot in one PyBullet client.
+
+    Equal loads and steps give bit-identical results, whatever the client simulated before.
+
+    Args:
+        gui: show PyBullet's window and run in real time; PyBullet allows one window a process.
+
+    Raises:
+        UserInputError: the window cannot be opened.
+
+    Example:
+        >>> from rcdsac_trl.seeding import stream
+        >>> from rcdsac_trl.world.maps.generator import Map
+        >>> from rcdsac_trl.world.maps.planner import Planner
+        >>> empty = Map(layout="clutter", size_m=20.0, boxes=(), cylinders=(), movers=())
+        >>> simulation = Simulation()
+        >>> simulation.load(empty, Planner(empty), (5.0, 5.0, 0.0), stream(0, "movers"))
+        >>> round(simulation.step(0.6, 0.0, motor_steps=7).v_c, 3)
+        0.21
+        >>> simulation.close()
+    """
+
+    def __init__(self, gui: bool = False) -> None:
+        self._gui = gui
+        try:
+            self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
+        except pybullet.error:
+            self._client = -1
+        if self._client < 0 and not gui:
+            raise UserInputError("PyBullet opens no more simulations in one process: use fewer agents or more workers")
+        if self._client < 0:
+            raise UserInputError("PyBullet could not open its window: gui=true needs a display; use gui=false")
+        self._pose = (0.0, 0.0, 0.0)
+        self._v_c = self._omega_c = 0.0
+        self._clearance_m = 0.0
+
+    def load(
+        self,
+        map: Map,
+        planner: WalkPlanner,
+        start_pose: tuple[float, float, float],
+        movers_rng: np.random.Generator,
+    ) -> None:
+        """Forget the old world and build a new one, the robot at rest.
+
+        Args:
+            map: what stands and what moves there.
+            planner: the map's planner; the movers' walks come from it.
+            start_pose: the robot's x, y in m and yaw in rad.
+            movers_rng: stream that the movers' walks are drawn from.
+        """
+        client = self._client
+        # By keyword: the first positional argument is `flags`, and the client would be client 0. Unlike
+        # removeBody this also frees the collision shapes.
+        pybullet.resetSimulation(physicsClientId=client)
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=MOTOR_PERIOD_S,
+            numSubSteps=1,
+            deterministicOverlappingPairs=1,
+            physicsClientId=client,
+        )
+        pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
+        visual = -1 if self._gui else bodies.invisible_shape(client)
+        bodies.add_static(client, map, visual)
+        self._robot = bodies.add_robot(client, start_pose, visual)
+        x, y, yaw = start_pose
+        self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
+        self._v_c = self._omega_c = self._clearance_m = 0.0
+        movers = self._movers = Movers(map, planner, start_pose[:2], movers_rng, MOTOR_PERIOD_S)
+        self._mover_bodies = list(
+            zip(bodies.add_movers(client, movers.discs, visual), movers.radii.tolist(), strict=True)
+        )
+        self._segments = np.ascontiguousarray(map.segments(), dtype=np.float64)
+        static = np.asarray(map.circles(), dtype=np.float64).reshape(-1, 3)
+        # The last rows are the movers' own, so that they are sensed where they walk.
+        self._circles = np.concatenate([static, movers.discs])
+        movers.discs = self._circles[len(static) :]
+        if self._gui:
+            bodies.look_from_above(client, map)
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """The robot's x, y in m and yaw in [-pi, pi] rad, map frame."""
+        return self._pose
+
+    @property
+    def mover_positions(self) -> NDArray[np.float64]:
+        """Where the movers are, float64 [k, 2], m; a copy."""
+        return self._movers.positions.copy()
+
+    @property
+    def mover_radii(self) -> NDArray[np.float64]:
+        """The movers' radii, float64 [k], m; a copy."""
+        return self._movers.radii.copy()
+
+    def step(self, v_u: float, omega_u: float, motor_steps: int) -> StepResult:
+        """Hold one pair of desired velocities for a number of motor steps.
+
+        Args:
+            v_u: desired linear velocity, m/s.
+            omega_u: desired angular velocity, rad/s.
+            motor_steps: how many steps of 0.02 s, at least 1.
+        """
+        client, robot, movers = self._client, self._robot, self._movers
+        x, y, yaw = self._pose
+        v_c, omega_c = self._v_c, self._omega_c
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        gap_m = movers.step(x, y)
+        self._sync_movers(x, y, everywhere=True)
+        duration_s = motor_steps * MOTOR_PERIOD_S
+        robot_m = max(abs(v_c), MAX_LINEAR_VELOCITY) * duration_s
+        approach_m = robot_m + movers.fastest_m_per_s * duration_s + _SLACK_M
+        # Movers that cannot notice the robot in this agent step walk through it at once.
+        unnoticed = gap_m > max(movers.notice_gap_m, _MOVER_SYNC_GAP_M) + approach_m and not self._gui
+        if unnoticed:
+            movers.step(x, y, motor_steps - 1)
+        # Contacts that cannot be are not asked for, nor the velocities that only contact would change.
+        in_contact = False
+        touchable = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
+        self._clearance_m = 0.0  # not known until the next scan
+        for motor_step in range(motor_steps):
+            if motor_step > 0 and not unnoticed:
+                gap_m = movers.step(x, y)
+                if gap_m < _MOVER_SYNC_GAP_M or self._gui:
+                    self._sync_movers(x, y, everywhere=self._gui)
+            v, omega = clip_command(v_u, omega_u, v_c, omega_c)
+            # By position, which PyBullet reads faster than keywords.
+            linear, angular = (v * cos, v * sin, 0.0), (0.0, 0.0, omega)
+            pybullet.resetBaseVelocity(robot, linear, angular, client)
+            pybullet.stepSimulation(client)
+            (x, y, _), turn = pybullet.getBasePositionAndOrientation(robot, client)
+            if touchable:
+                linear, angular = pybullet.getBaseVelocity(robot, client)
+            yaw = 2.0 * math.atan2(turn[2], turn[3])
+            cos, sin = math.cos(yaw), math.sin(yaw)
+            v_c = linear[0] * cos + linear[1] * sin
+            omega_c = angular[2]
+            if touchable and not in_contact:
+                points = pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
+                in_contact = any(point[8] <= CONTACT_DISTANCE_M for point in points)
+            if self._gui:
+                time.sleep(MOTOR_PERIOD_S)
+        self._pose = (x, y, math.remainder(yaw, 2.0 * math.pi))
+        self._v_c, self._omega_c = v_c, omega_c
+        return StepResult(self._pose, v_c, omega_c, in_contact)
+
+    def scan(self) -> NDArray[np.float64]:
+        """Return the exact smallest distance from the robot's centre in each 2-degree sector.
+
+        Returns:
+            float64 [180], m; ``inf`` where nothing is within 3 m. See
+            :func:`rcdsac_trl.world.sim.lidar.sector_distances`.
+        """
+        distances = np.empty(NUM_BINS)
+        self._clearance_m = scan(distances, *self._pose, self._segments, self._circles)
+        return distances
+
+    def close(self) -> None:
+        """Disconnect from PyBullet; harmless when done before."""
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+    def _sync_movers(self, robot_x: float, robot_y: float, everywhere: bool) -> None:
+        """Tell PyBullet where the movers are: all of them, or only those that the robot could touch."""
+        near = ROBOT_RADIUS_M + _MOVER_SYNC_GAP_M
+        for (body, radius), (x, y, _) in zip(self._mover_bodies, self._movers.discs.tolist(), strict=True):
+            if everywhere or math.hypot(x - robot_x, y - robot_y) < near + radius:
+                pybullet.resetBasePositionAndOrientation(body, (x, y, 0.0), _UPRIGHT, self._client)

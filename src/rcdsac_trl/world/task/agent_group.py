@@ -1,0 +1,174 @@
+"""A group of agents, as one environment holds them: the core that both adapters share.
+
+It knows neither TorchRL nor Gymnasium: :mod:`rcdsac_trl.world.task.env` and
+:mod:`rcdsac_trl.world.task.gymnasium_env` are thin adapters over :class:`AgentGroup`.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import range_observation, waypoint_observation
+from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.world.maps.generator import SPLITS, MapSettings, Split
+from rcdsac_trl.world.render import Scene
+from rcdsac_trl.world.task import rules
+from rcdsac_trl.world.task.episode import NavigationAgent
+from rcdsac_trl.world.task.rules import TaskSettings
+from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, Buffers
+
+# A tanh or a clamp in float32 stays within 1; this forgives rounding in other arithmetic.
+_ACTION_TOLERANCE = 1e-6
+
+
+class AgentGroup:
+    """The agents that one environment holds, each in its own simulation and with its own episode counter.
+
+    Args:
+        map_settings: how maps are generated.
+        task: rules of the task.
+        sensor: one of :data:`rcdsac_trl.robot.range_sensor.SENSORS`.
+        split: which of the disjoint map sets.
+        seed: root seed, at least 0.
+        agent_ids: the agents' global numbers, at least 0; agents with equal numbers meet the same episodes.
+        first_episode: number of each agent's first episode, at least 0.
+        gui: show PyBullet's window for the first agent.
+
+    Attributes:
+        buffers: what the agents wrote last, overwritten by every reset and step.
+
+    Raises:
+        UserInputError: a value is outside its limits.
+    """
+
+    def __init__(
+        self,
+        map_settings: MapSettings | None,
+        task: TaskSettings | None,
+        *,
+        sensor: str,
+        split: Split,
+        seed: int,
+        agent_ids: Sequence[int],
+        first_episode: int,
+        gui: bool,
+    ) -> None:
+        if split not in SPLITS:
+            raise UserInputError(f"split={split!r} does not exist; choose one of {', '.join(SPLITS)}")
+        if not agent_ids or min(agent_ids) < 0:
+            raise UserInputError(f"agent_ids={list(agent_ids)} must be one or more whole numbers of at least 0")
+        self.task = task or TaskSettings()
+        mask = sensor_mask(sensor)
+        self._agents = [
+            NavigationAgent(
+                map_settings or MapSettings(),
+                self.task,
+                mask,
+                split,
+                agent_id,
+                gui=gui and row == 0,  # PyBullet opens one window a process
+            )
+            for row, agent_id in enumerate(agent_ids)
+        ]
+        self._mask = mask
+        self._first_episode = _not_negative("first_episode", first_episode)
+        self.buffers = Buffers.zeros(len(agent_ids))
+        self.set_seed(seed)
+
+    def __len__(self) -> int:
+        """Return the number of agents."""
+        return len(self._agents)
+
+    def set_seed(self, seed: int) -> None:
+        """Set the root seed; the next reset of each agent begins its first episode."""
+        self._seed = _not_negative("seed", seed)
+        self._next_episodes = [self._first_episode] * len(self)
+
+    def reset(self, rows: Iterable[int], episode: int | None = None) -> None:
+        """Begin an episode of some agents: their next one, or the given one, from which they count on."""
+        begun = list(rows)
+        for row in begun:
+            number = self._next_episodes[row] if episode is None else _not_negative("episode", episode)
+            self._agents[row].reset(self._seed, number)
+            self._next_episodes[row] = number + 1
+        self.buffers.reward[begun] = 0.0
+        self._collect(begun)
+
+    def step(self, actions: NDArray, collision_weights: NDArray | None = None) -> None:
+        """Take one agent step with every agent.
+
+        Args:
+            actions: normalised actions, [n, 2], in [-1, 1].
+            collision_weights: factor of each agent's collision reward, [n], None for 1; the components are
+                written without it.
+
+        Raises:
+            UserInputError: an action is not a number in [-1, 1], or an agent was never reset.
+        """
+        buffers = self.buffers
+        for agent, action in zip(self._agents, self._checked(actions), strict=True):
+            agent.step(action)
+        self._collect(range(len(self)))
+        weights = 1.0 if collision_weights is None else collision_weights
+        buffers.reward[:, 0] = rules.total_reward(buffers.reward_components, weights)
+
+    def scene(self, row: int) -> Scene:
+        """Return what a picture of one agent shows."""
+        return self._agents[row].scene()
+
+    def close(self) -> None:
+        """Disconnect all simulations."""
+        for agent in self._agents:
+            agent.close()
+
+    def _checked(self, actions: NDArray) -> list[list[float]]:
+        values: list[list[float]] = actions.tolist()
+        limit = 1.0 + _ACTION_TOLERANCE
+        # The comparison is false for NaN too. As plain numbers: there are few, and NumPy has a price a call.
+        inside = actions.shape == (len(self), ACTION_SIZE) and all(
+            -limit <= linear <= limit and -limit <= angular <= limit for linear, angular in values
+        )
+        if not inside:
+            raise UserInputError(
+                f"actions {values} must be {ACTION_SIZE} numbers in [-1, 1] for each of "
+                f"{len(self)} agents; look for NaN in the policy, or scale its output"
+            )
+        return values
+
+    def _collect(self, rows: Sequence[int]) -> None:
+        """Write what some agents found: one array operation a key for all of them, not one for each."""
+        if not rows:
+            return
+        buffers, agents = self.buffers, [self._agents[row] for row in rows]
+        at = slice(None) if len(rows) == len(self) else rows
+        distances = np.array([agent.distances_m for agent in agents])
+        buffers.range[at] = range_observation(distances, self._mask)
+        numbers = np.array(
+            [
+                (
+                    *waypoint_observation(agent.pose, *agent.next_waypoints),
+                    *agent.velocities,
+                    *agent.pose,
+                    *agent.reward_components,
+                    agent.in_contact,
+                    agent.goal_reached,
+                )
+                for agent in agents
+            ],
+            dtype=np.float32,
+        )
+        limits = SPACES["velocity"]
+        buffers.waypoint[at] = numbers[:, :6]
+        buffers.velocity[at] = np.minimum(np.maximum(numbers[:, 6:10], limits.low), limits.high)
+        buffers.pose[at] = numbers[:, 10:13]
+        buffers.reward_components[at] = numbers[:, 13:18]
+        buffers.contact[at] = numbers[:, 18:19]
+        buffers.goal_reached[at] = numbers[:, 19:20]
+
+
+def _not_negative(name: str, value: int) -> int:
+    if not isinstance(value, int | np.integer) or value < 0:
+        raise UserInputError(f"{name}={value!r} must be a whole number of at least 0")
+    return int(value)

@@ -1,0 +1,206 @@
+"""One agent's episodes: its starts, goals and waypoints, its contacts and what it is paid.
+
+Everything random in episode ``k`` of agent ``i`` comes from ``stream(seed, "<purpose>/<split>", k, i, ...)``,
+and each goal is drawn relative to the goal before it. So maps, starts, goals and control periods are the same
+whatever the agent does, and whichever group and process holds it.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.observation import Point, distance_and_bearing
+from rcdsac_trl.seeding import stream
+from rcdsac_trl.world.maps.generator import MapSettings, Split, generate_map
+from rcdsac_trl.world.maps.planner import Planner
+from rcdsac_trl.world.maps.shapes import Map
+from rcdsac_trl.world.render import Scene
+from rcdsac_trl.world.sim.simulation import Simulation
+from rcdsac_trl.world.task import rules
+from rcdsac_trl.world.task.rules import TaskSettings
+
+Pose = tuple[float, float, float]
+
+# The agents of a process walk through the maps together. A few more maps stay, so that an agent that was
+# reset alone, or an evaluation beside the training, does not make the others' map again.
+_MAPS_KEPT = 8
+_TRAIL_STEPS = 1000
+
+
+@lru_cache(maxsize=_MAPS_KEPT)
+def load_map(settings: MapSettings, split: Split, seed: int, index: int) -> tuple[Map, Planner]:
+    """Return a map and its planner, shared by all agents of this process.
+
+    Args:
+        settings: how maps are generated.
+        split: which of the disjoint map sets.
+        seed: root seed.
+        index: which map; episode ``k`` of every agent takes place on map ``k``.
+    """
+    map_ = generate_map(settings, split, seed, index)
+    return map_, Planner(map_)
+
+
+def draw_motor_steps(task: TaskSettings, split: Split, seed: int, episode: int, agent_id: int) -> int:
+    """Return how many motor steps an agent step of this episode takes: its control period."""
+    rng = stream(seed, f"motor_steps/{split}", episode, agent_id)
+    return int(rng.choice(task.motor_steps))
+
+
+class NavigationAgent:
+    """One robot in its own simulation.
+
+    The simulation is made at the first reset, so that making an agent costs nothing.
+
+    Args:
+        map_settings: how maps are generated.
+        task: rules of the task.
+        mask: bins that the sensor has, bool [180].
+        split: which of the disjoint map sets.
+        agent_id: the agent's global number, which its random streams derive from.
+        gui: show PyBullet's window.
+
+    Attributes:
+        pose: x, y in m and yaw in rad, map frame.
+        velocities: measured linear and angular velocity, then the desired ones, m/s and rad/s: o_velocity.
+        in_contact: whether the robot touched anything in the last step.
+        goal_reached: whether it reached its goal in the last step.
+        reward_components: of the last step, see :func:`~rcdsac_trl.world.task.rules.reward_components`; zeros after
+            a reset.
+        distances_m: what the range sensor measures, float64 [180], m.
+    """
+
+    pose: Pose
+    velocities: tuple[float, float, float, float]
+    in_contact: bool
+    goal_reached: bool
+    reward_components: tuple[float, float, float, float, float]
+    distances_m: NDArray[np.float64]
+
+    def __init__(
+        self,
+        map_settings: MapSettings,
+        task: TaskSettings,
+        mask: NDArray[np.bool_],
+        split: Split,
+        agent_id: int,
+        gui: bool = False,
+    ) -> None:
+        self._map_settings = map_settings
+        self._task = task
+        self._mask = mask
+        self._split = split
+        self._agent_id = agent_id
+        self._gui = gui
+        self._simulation: Simulation | None = None
+        self._trail: deque[tuple[float, float]] = deque(maxlen=_TRAIL_STEPS)
+
+    def reset(self, seed: int, episode: int) -> None:
+        """Begin an episode, on the map of the same number."""
+        self._seed, self._episode = seed, episode
+        self._map, self._planner = load_map(self._map_settings, self._split, seed, episode)
+        rng = self._stream("start")
+        x, y = self._planner.sample_free(rng).tolist()
+        self.pose = (x, y, rng.uniform(-math.pi, math.pi))
+        self._motor_steps = draw_motor_steps(self._task, self._split, seed, episode, self._agent_id)
+        if self._simulation is None:
+            self._simulation = Simulation(gui=self._gui)
+        self._simulation.load(self._map, self._planner, self.pose, self._stream("movers"))
+        self._noise = self._stream("noise")
+        self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._task.action_delay_steps)
+        self._goals_drawn = 0
+        self._goal = x, y
+        self._draw_goal()
+        self._trail.clear()
+        self.in_contact = self.goal_reached = False
+        self.velocities = (0.0, 0.0, 0.0, 0.0)
+        self.reward_components = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self._sense()
+
+    def step(self, action: Sequence[float]) -> None:
+        """Take one agent step."""
+        simulation, task = self._require_simulation(), self._task
+        v_u, omega_u = desired_velocities(action)
+        self._delayed.append((v_u, omega_u))
+        moved = simulation.step(*self._delayed.popleft(), self._motor_steps)
+        collided = rules.collision_due(moved.in_contact, self.in_contact, task.collision_penalty_mode)
+        self.in_contact = moved.in_contact
+        self.pose = moved.pose
+        # The step is paid for progress to the waypoint that was next while it was taken.
+        _, bearing = distance_and_bearing(self.pose, self._path[self._next])
+        self.goal_reached = self._distance_to(self._goal) < task.goal_radius_m
+        self.reward_components = rules.reward_components(
+            moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached
+        )
+        if self.goal_reached:
+            self._draw_goal()
+        else:
+            self._take_waypoints()
+        v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, task.odometry_noise_std, self._noise)
+        self.velocities = (v_c, omega_c, v_u, omega_u)
+        self._sense()
+
+    @property
+    def next_waypoints(self) -> tuple[Point, Point]:
+        """The next waypoint and the one after it, m; on the last leg both are the goal."""
+        return self._path[self._next], self._path[min(self._next + 1, len(self._path) - 1)]
+
+    def scene(self) -> Scene:
+        """Return what a picture of this moment shows."""
+        simulation = self._require_simulation()
+        return Scene(
+            map=self._map,
+            pose=self.pose,
+            distances_m=self.distances_m,
+            sensor_mask=self._mask,
+            waypoints=np.array(self._path[self._next :]),
+            movers=np.column_stack([simulation.mover_positions, simulation.mover_radii]),
+            trail=tuple(self._trail),
+            in_contact=self.in_contact,
+        )
+
+    def close(self) -> None:
+        """Disconnect from the physics engine."""
+        if self._simulation is not None:
+            self._simulation.close()
+            self._simulation = None
+
+    def _require_simulation(self) -> Simulation:
+        if self._simulation is None:
+            raise UserInputError("the environment was stepped or drawn before its first reset; call reset() first")
+        return self._simulation
+
+    def _stream(self, purpose: str, *index: int) -> np.random.Generator:
+        return stream(self._seed, f"{purpose}/{self._split}", self._episode, self._agent_id, *index)
+
+    def _draw_goal(self) -> None:
+        """Draw the next goal relative to the last one, and plan to it from where the robot is."""
+        rng = self._stream("goal", self._goals_drawn)
+        self._goals_drawn += 1
+        goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
+        # As plain floats: single numbers out of arrays are slow, and every step reads some.
+        self._path = [(x, y) for x, y in self._planner.waypoints(self.pose[:2], goal).tolist()]
+        self._goal = self._path[-1]
+        self._next = 0
+        self._take_waypoints()
+
+    def _take_waypoints(self) -> None:
+        """Pass every corner point within reach; the goal itself stays until it is reached."""
+        last = len(self._path) - 1
+        while self._next < last and self._distance_to(self._path[self._next]) < self._task.waypoint_radius_m:
+            self._next += 1
+
+    def _distance_to(self, point: Point) -> float:
+        return math.hypot(point[0] - self.pose[0], point[1] - self.pose[1])
+
+    def _sense(self) -> None:
+        self._trail.append(self.pose[:2])
+        task = self._task
+        distances = self._require_simulation().scan()
+        self.distances_m = rules.noisy_ranges(distances, task.range_noise_std_m, task.range_dropout, self._noise)

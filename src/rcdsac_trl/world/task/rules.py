@@ -1,0 +1,191 @@
+"""The task: its settings, what the robot is paid, and the noise of its sensors, as pure functions.
+
+Everything here follows the paper's section "Reward"; nothing here holds state. Whoever steps the world calls these
+functions and keeps the state. What the robot is told and what its actions mean is :mod:`rcdsac_trl.robot.interface`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import inside_dead_band
+
+# Reward (paper, section "Reward").
+BASE_REWARD = -0.02
+GOAL_REWARD = 10.0
+COLLISION_REWARD = -10.0
+MIN_WAYPOINT_REWARD = -0.1
+STRAIGHT_FACTOR = 1.2
+"""r_angular while the desired angular velocity is inside the dead band."""
+MIN_TURN_FACTOR = 0.5
+TURN_SCALE = math.radians(120.0)
+"""The desired angular velocity at which 1 - |omega_u| / scale would reach 0, rad/s."""
+
+CollisionPenaltyMode = Literal["onset", "per_step"]
+"""When r_coll is paid: once as a contact begins, or in every agent step in contact."""
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """What the task leaves to choose; every field is a key of ``conf/task/*.yaml``.
+
+    Attributes:
+        episode_steps: agent steps in an episode.
+        collision_penalty_mode: ``"onset"`` pays -10 once, as a contact begins; ``"per_step"`` in every agent
+            step in contact.
+        waypoint_radius_m: a waypoint nearer than this gives way to the next.
+        goal_radius_m: a goal nearer than this is reached.
+        min_path_m: shortest path from where the robot is to a new goal.
+        motor_steps: numbers of 0.02 s motor steps in an agent step; an episode draws one of them.
+        range_noise_std_m: standard deviation of the noise on a range.
+        range_dropout: probability that a range is lost (reads as "nothing there"), per bin and step.
+        odometry_noise_std: standard deviations of the noise on the measured velocities, (m/s, rad/s).
+        action_delay_steps: agent steps an action waits before it acts.
+
+    Raises:
+        UserInputError: a value is outside its limits.
+
+    Example:
+        >>> TaskSettings().motor_steps
+        (6, 7, 8)
+    """
+
+    episode_steps: int = 1000
+    collision_penalty_mode: CollisionPenaltyMode = "onset"
+    waypoint_radius_m: float = 0.5
+    goal_radius_m: float = 0.15
+    min_path_m: float = 4.0
+    motor_steps: tuple[int, ...] = (6, 7, 8)
+    range_noise_std_m: float = 0.0
+    range_dropout: float = 0.0
+    odometry_noise_std: tuple[float, float] = (0.0, 0.0)
+    action_delay_steps: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse what is outside the limits."""
+        for name in ("motor_steps", "odometry_noise_std"):
+            if not isinstance(getattr(self, name), Sequence):
+                raise UserInputError(f"{name}={getattr(self, name)} must be a list of numbers, such as [6, 7, 8]")
+        # Hydra hands lists over; a frozen value keeps tuples.
+        object.__setattr__(self, "motor_steps", tuple(self.motor_steps))
+        object.__setattr__(self, "odometry_noise_std", tuple(self.odometry_noise_std))
+        if self.episode_steps < 1:
+            raise UserInputError(f"episode_steps={self.episode_steps} must be at least 1")
+        modes = get_args(CollisionPenaltyMode)
+        if self.collision_penalty_mode not in modes:
+            raise UserInputError(
+                f"collision_penalty_mode={self.collision_penalty_mode!r} does not exist; choose {' or '.join(modes)}"
+            )
+        for name in ("waypoint_radius_m", "goal_radius_m", "min_path_m"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise UserInputError(f"{name}={getattr(self, name)} must be a positive number of metres")
+        if not self.motor_steps or any(n != int(n) or n < 1 for n in self.motor_steps):
+            raise UserInputError(
+                f"motor_steps={list(self.motor_steps)} must be whole numbers of at least 1, such as [6, 7, 8]"
+            )
+        if not 0.0 <= self.range_noise_std_m < math.inf:
+            raise UserInputError(f"range_noise_std_m={self.range_noise_std_m} must be 0 or more")
+        if not 0.0 <= self.range_dropout <= 1.0:
+            raise UserInputError(f"range_dropout={self.range_dropout} is a probability; give 0 to 1")
+        if len(self.odometry_noise_std) != 2 or not all(0.0 <= s < math.inf for s in self.odometry_noise_std):
+            raise UserInputError(
+                f"odometry_noise_std={list(self.odometry_noise_std)} must be two numbers of 0 or more: m/s and rad/s"
+            )
+        if self.action_delay_steps < 0:
+            raise UserInputError(f"action_delay_steps={self.action_delay_steps} must be 0 or more")
+
+
+def reward_components(
+    v_c: float, theta_1: float, omega_u: float, in_contact: bool, collided: bool, goal_reached: bool
+) -> tuple[float, float, float, float, float]:
+    """Return the five parts of the reward: base, goal, waypoint, angular, collision.
+
+    Args:
+        v_c: linear velocity measured after the step, m/s.
+        theta_1: bearing, after the step, of the waypoint that was next during the step, rad.
+        omega_u: desired angular velocity after the dead band, rad/s.
+        in_contact: whether the robot touched anything during the step; r_waypoint is 0 then.
+        collided: whether r_coll is due; see :func:`collision_due`.
+        goal_reached: whether the goal was reached in this step.
+
+    Example:
+        >>> reward_components(0.5, 0.0, 0.0, False, False, False)
+        (-0.02, 0.0, 0.5, 1.2, 0.0)
+    """
+    waypoint = 0.0 if in_contact else max(MIN_WAYPOINT_REWARD, max(0.0, v_c) * math.cos(theta_1))
+    turning = max(MIN_TURN_FACTOR, 1.0 - abs(omega_u) / TURN_SCALE)
+    angular = STRAIGHT_FACTOR if inside_dead_band(omega_u) else turning
+    goal = GOAL_REWARD if goal_reached else 0.0
+    collision = COLLISION_REWARD if collided else 0.0
+    return BASE_REWARD, goal, waypoint, angular, collision
+
+
+def total_reward(components: ArrayLike, collision_weight: float | NDArray[np.float32] = 1.0) -> NDArray[np.float32]:
+    """Return r = r_base + r_goal + r_waypoint * r_angular + w_coll * r_coll, float32 [...].
+
+    Args:
+        components: [..., 5], from :func:`reward_components`.
+        collision_weight: w_coll; 1 but for RCWR.
+
+    Example:
+        >>> float(total_reward([0.0, 10.0, 0.5, 0.5, -10.0], collision_weight=2.0))
+        -9.75
+    """
+    c = np.asarray(components, dtype=np.float32)
+    total = c[..., 0] + c[..., 1] + c[..., 2] * c[..., 3] + collision_weight * c[..., 4]
+    return np.asarray(total, dtype=np.float32)
+
+
+def collision_due(in_contact: bool, was_in_contact: bool, mode: CollisionPenaltyMode) -> bool:
+    """Return whether r_coll is paid in this agent step.
+
+    Args:
+        in_contact: contact in any motor step of this agent step.
+        was_in_contact: the same of the agent step before; False in an episode's first.
+        mode: ``"onset"`` pays the first step of a contact, ``"per_step"`` each.
+
+    Example:
+        >>> collision_due(True, True, "onset"), collision_due(True, True, "per_step")
+        (False, True)
+    """
+    return in_contact and (mode == "per_step" or not was_in_contact)
+
+
+def noisy_ranges(
+    distances: NDArray[np.float64], noise_std_m: float, dropout: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return the distances a noisy sensor reports; with both options at 0 they are returned as they are.
+
+    Args:
+        distances: [180], m; ``inf`` where nothing is, and there it stays.
+        noise_std_m: standard deviation of additive normal noise.
+        dropout: probability that a bin reports nothing (``inf``).
+        rng: the noise's own stream.
+    """
+    if noise_std_m > 0.0:
+        distances = distances + noise_std_m * rng.standard_normal(distances.shape)
+    if dropout > 0.0:
+        distances = np.where(rng.random(distances.shape) < dropout, np.inf, distances)
+    return distances
+
+
+def noisy_velocities(
+    v_c: float, omega_c: float, noise_std: tuple[float, float], rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return the velocities noisy odometry reports, m/s and rad/s; with both deviations at 0 as they are.
+
+    Args:
+        v_c: measured linear velocity, m/s.
+        omega_c: measured angular velocity, rad/s.
+        noise_std: standard deviations of additive normal noise, (m/s, rad/s).
+        rng: the noise's own stream.
+    """
+    if noise_std == (0.0, 0.0):
+        return v_c, omega_c
+    noise = rng.standard_normal(2)
+    return v_c + noise_std[0] * float(noise[0]), omega_c + noise_std[1] * float(noise[1])

@@ -1,0 +1,415 @@
+"""The command line: a mistake ends in one sentence and code 2, with nothing written; Ctrl-C ends in a checkpoint."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import tiny
+from rcdsac_trl import evaluate, train
+from rcdsac_trl.cli import precheck
+from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation.evaluation_run import EvaluationRun
+from rcdsac_trl.storage.checkpoint_record import load_progress
+from tiny import ROWS, TINY
+
+POW = "+algo=rcdsac_pow"
+ALL_ROWS = ", ".join(ROWS)
+# keep_pages() would otherwise start this process, and with it the tests, again.
+NO_RESTART = {"MALLOC_MMAP_MAX_": "0"}
+
+
+@pytest.fixture
+def refusal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[[Callable[[], None], list[str]], str]:
+    """Call an entry point that must refuse; return the sentence, without the program's name."""
+    monkeypatch.chdir(tmp_path)
+    for name, value in NO_RESTART.items():
+        monkeypatch.setenv(name, value)
+
+    def started(*_: object) -> None:
+        raise AssertionError("it was not refused")
+
+    monkeypatch.setattr("rcdsac_trl.training.setup.make_trainer", started)
+    monkeypatch.setattr(EvaluationRun, "run", started)
+
+    def call(main: Callable[[], None], arguments: list[str]) -> str:
+        monkeypatch.setattr(sys, "argv", ["prog", *arguments])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as left:
+            main()
+        assert left.value.code == 2
+        out, err = capfd.readouterr()
+        assert out == ""
+        assert err.count("\n") == 1
+        assert err.startswith("rcdsac_trl: ")
+        assert list(tmp_path.iterdir()) == []
+        return err.removeprefix("rcdsac_trl: ").strip()
+
+    return call
+
+
+# ------------------------------------------------------------------------------------------------ train
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        # what names the choices
+        ([], f"no algorithm chosen: add +algo=<name>, one of {ALL_ROWS}"),
+        (["algo=sac"], f"write +algo=<name> (with a plus): one of {ALL_ROWS}"),
+        (["+algo=ppo"], f"algo=ppo does not exist: choose one of {ALL_ROWS}"),
+        ([POW, "sensor=wide"], "sensor=wide does not exist: choose one of full, narrow, sparse"),
+        ([POW, "map=moon"], "map=moon does not exist: choose one of "),
+        ([POW, "preset=tiny"], "preset=tiny does not exist: choose one of "),
+        ([POW, "algo/distortion=mean"], "algo/distortion=mean does not exist: choose one of cpw, cvar, "),
+        ([POW, "map=null"], "map=null chooses nothing: choose one of "),
+        ([POW, "+map=easy"], "map is chosen twice: write map=<name> once, without a plus"),
+        ([POW, "sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
+        # misspelt, unknown and missing keys
+        ([POW, "learner.batchsize=3"], "there is no key learner.batchsize: did you mean learner.batch_size?"),
+        ([POW, "sede=3"], "there is no key sede: did you mean seed?"),
+        ([POW, "schedul.iterations=3"], "there is no key schedul.iterations: did you mean schedule.iterations?"),
+        ([POW, "+batch_size=3"], "there is no key batch_size"),
+        ([POW, "+learner.seqence_length=3"], "there is no key learner.seqence_length: did you mean learner.sequence"),
+        ([POW, "+algo.distortion.hihg=0"], "there is no key algo.distortion.hihg: did you mean algo.distortion.high?"),
+        ([POW, "~learner.gamma"], "learner.gamma is missing: give it a value"),
+        (["algo.beta=-1"], "algo.beta needs a choice of algo: add +algo=<name>, one of "),
+        # beta
+        (["+algo=dsac_pow", "algo.beta=-3"], "beta = -3 is outside the domain [-2, 0] of measure 'pow'"),
+        (["+algo=dsac_cvar", "algo.beta=0"], "beta = 0 is outside the domain (0, 1] of measure 'cvar'"),
+        (["+algo=dsac_pow", "algo.beta=low"], "algo.beta=low must be a number or null"),
+        ([POW, "algo.beta=-1"], "algo.beta=-1 does not go with algo.conditioning=per_episode"),
+        (["+algo=sac", "algo.beta=-1"], "algo.beta=-1 does not go with algo.conditioning=none"),
+        ([POW, "algo.distortion.low=-5"], "beta = -5 is outside the domain [-2, 0] of measure 'pow'"),
+        (
+            [POW, "algo.distortion.evaluation_betas=[]"],
+            "algo.distortion.evaluation_betas=[] leaves nothing to validate",
+        ),
+        ([POW, "algo/distortion=var", "schedule.neutral_iterations=1"], "measure 'var' has no neutral beta"),
+        # types and limits
+        ([POW, "learner.batch_size=abc"], "learner.batch_size=abc must be a whole number"),
+        ([POW, "learner.batch_size=2.0"], "learner.batch_size=2.0 must be a whole number"),
+        ([POW, "learner.batch_size=-1"], "learner.batch_size=-1 is not a number of at least 1"),
+        ([POW, "learner.actor_lr=inf"], "learner.actor_lr=inf must be a number"),
+        ([POW, "learner.actor_lr=0"], "learner.actor_lr=0 is not a positive number"),
+        ([POW, "learner.gamma=1"], "learner.gamma=1 is outside [0, 1)"),
+        ([POW, "learner.target_coefficient=0"], "learner.target_coefficient=0 is outside (0, 1]"),
+        ([POW, "learner.num_critics=3"], "learner.num_critics=3 is neither 1 nor 2"),
+        ([POW, "learner.resample_per=step"], "learner.resample_per=step must be one of transition, sequence"),
+        ([POW, "learner=5"], "learner=5 must be a section with keys of its own"),
+        ([POW, "seed=1.5"], "seed=1.5 must be a whole number"),
+        ([POW, "seed=true"], "seed=True must be a whole number"),
+        ([POW, "seed=-1"], "seed=-1 must be at least 0"),
+        ([POW, "seed='\n\x1b[2J'"], r"seed=\n\x1b[2J must be a whole number"),
+        ([POW, "seed=???"], "seed=??? must be a whole number"),
+        ([POW, "schedule.iterations=0"], "schedule.iterations=0 is not a number of at least 1"),
+        ([POW, "schedule.pursuit_noise=-1"], "schedule.pursuit_noise=-1 is not a number of at least 0"),
+        ([POW, "validation.num_maps=0"], "validation.num_maps=0 must be at least 1"),
+        ([POW, "validation.every_iterations=0"], "validation.every_iterations=0 must be at least 1"),
+        ([POW, "validation.processes=-1"], "validation.processes=-1 must be at least 0"),
+        ([POW, "checkpoint.every_iterations=-5"], "checkpoint.every_iterations=-5 must be at least 1"),
+        ([POW, "network.memory=0"], "memory = 0 is below 1"),
+        ([POW, "map.size_m=big"], "map.size_m=big must be a number"),
+        ([POW, "map.num_movers=-1"], "num_movers is -1 but must be"),
+        ([POW, "map.layouts=rooms"], "map.layouts=rooms must be a list of words in brackets"),
+        ([POW, "task.motor_steps=[6,a]"], "task.motor_steps=[6, 'a'] must be a list of whole numbers in brackets"),
+        (
+            [POW, "task.collision_penalty_mode=never"],
+            "task.collision_penalty_mode=never must be one of onset, per_step",
+        ),
+        ([POW, "threads=all"], "threads=all must be a whole number or auto"),
+        ([POW, "threads=0"], "threads=0 is not a whole number of at least 1"),
+        ([POW, "device=tpu"], "device=tpu is not supported: use auto, cpu, cuda or cuda:<number>"),
+        ([POW, "device=cuda:99"], "device=cuda:99, but torch does not see it here"),
+        (
+            [POW, "logger.backends=[paper]"],
+            "logger.backends holds 'paper': choose among csv, tensorboard, wandb, mlflow",
+        ),
+        ([POW, "logger.backends=csv"], "logger.backends=csv must be a list of words in brackets"),
+        # what does not go together
+        (
+            [POW, "collector=single", "world.num_agents=10", "world.num_workers=3"],
+            "num_workers=3 cannot share 10 agents evenly",
+        ),
+        ([POW, "world.num_workers=2"], "world.num_workers=2 does nothing with collector=multi: give collector.num_pro"),
+        (
+            [POW, "collector=single", "+collector.num_processes=2"],
+            "collector.num_processes=2 does nothing with collector=single: give world.num_workers",
+        ),
+        (
+            [POW, "+collector.address=auto"],
+            "collector.address=auto does nothing with collector=multi: take",
+        ),
+        (
+            [POW, "collector=ray", "collector.num_processes=0"],
+            "collector.num_processes=0 leaves collector=ray nothin",
+        ),
+        (
+            [POW, "collector=ray", "collector.num_processes=3"],
+            "collector.num_processes=3 cannot share world.num_agents=10 evenly: give a divisor",
+        ),
+        (
+            [POW, "+collector.slurm={partition: long, timeout_min: 9}"],
+            "collector.slurm does nothing with collector=multi: take collector=distributed",
+        ),
+        (
+            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 9}"],
+            "collector.num_processes=auto counts the cores of this machine, not SLURM's",
+        ),
+        (
+            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 0}"],
+            "collector.slurm.timeout_min=0 must be at least 1",
+        ),
+        ([POW, "collector.num_processes=-1"], "collector.num_processes=-1 is not a number of processes"),
+        ([POW, "world.num_agents=0"], "world.num_agents=0 is below 1"),
+        ([POW, "task.episode_steps=5", "learner.sequence_length=6"], "learner.sequence_length=6 is longer than an epi"),
+        (
+            [POW, "replay.capacity_steps=100"],
+            "replay.capacity_steps=100 does not hold the 10000 steps of one iteration",
+        ),
+        # what Hydra itself refuses
+        ([POW, "learner.batch_size=["], "learner.batch_size=[ cannot be read: write it as <key>=<value>"),
+        ([POW, "+="], "+= names no key: write it as <key>=<value>"),
+        ([POW, "hydra/launcher=far"], "hydra/launcher=far does not exist: leave it out"),
+        ([POW, "fast"], "fast cannot be read: write it as <key>=<value>"),
+        ([POW, "seed=${foo}"], "Interpolation key 'foo' not found"),
+        ([POW, "seed=0,1"], "seed=0,1 holds several values: write a list in brackets, or add -m"),
+        ([POW, "--fast"], "there is no option --fast"),
+        ([POW, "--config-dir=/nowhere"], "--config-dir cannot be used: choose with overrides"),
+        ([POW, "--config-name=evaluate"], "--config-name cannot be used: choose with overrides"),
+        ([POW, "--run", "-m"], "--run and --multirun do not go together: leave all but one out"),
+        ([POW, "hydra.run.dir=''"], "hydra.run.dir names no folder: give it one, or leave it out"),
+        ([POW, "hydra.run.dir=/proc/x/y"], "nothing can be written into /proc ("),
+        ([POW, "resume="], "resume names no folder: give it one, or auto, or leave it out"),
+        ([POW, "threads=1000000"], "threads=1000000 is above 1024: "),
+        # a multirun is checked whole, before its first job
+        (["-m", POW, "seed=0,abc"], "seed=abc must be a whole number"),
+        (["-m", "+algo=sac,ppo"], "algo=ppo does not exist"),
+        (["-m", "seed=0,1"], "no algorithm chosen"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_train_refuses(refusal: Callable, arguments: list[str], sentence: str) -> None:
+    assert sentence in refusal(train.main, arguments)
+
+
+@pytest.mark.parametrize("backend", ["wandb", "mlflow"])
+def test_train_refuses_a_logger_that_is_not_installed(
+    refusal: Callable, monkeypatch: pytest.MonkeyPatch, backend: str
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    told = refusal(train.main, [POW, f"logger={backend}"])
+    assert told == f"logger {backend} is not installed: pip install 'rcdsac-trl[{backend}]', or use logger=default"
+
+
+def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Path) -> None:
+    before = sorted((path, path.stat().st_mtime_ns) for path in tiny_run.rglob("*"))
+    told = refusal(train.main, [POW, f"hydra.run.dir={tiny_run}"])
+    assert told == f"{tiny_run} already holds a run: choose another hydra.run.dir"
+    assert sorted((path, path.stat().st_mtime_ns) for path in tiny_run.rglob("*")) == before
+
+
+# ------------------------------------------------------------------------------------------------ evaluate
+RUN = "run=<the tiny run>"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ([], "name what to evaluate: either run=<folder> or baseline=pursuit"),
+        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=pursuit"),
+        (["run=nowhere"], "run=nowhere holds no config.yaml: name a folder that training wrote"),
+        (["run=123"], "run=123 must be text or null"),
+        ([RUN], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
+        ([RUN, "beta=[]"], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
+        ([RUN, "beta=[-1,-3]"], "beta = -3 is outside the domain [-2, 0] of measure 'pow'"),
+        ([RUN, "beta=-1"], "beta=-1 must be a list of numbers in brackets or null"),
+        ([RUN, "beta=[low]"], "beta=['low'] must be a list of numbers in brackets or null"),
+        ([RUN, "beta=[-1,-1.0]"], "beta=-1 is given more than once"),
+        ([RUN, "beta=[-1]", "collision_weight=[1]"], "rcdsac_pow has no collision weight: leave collision_weight out"),
+        ([RUN, "beta=[-1]", "sensor=sparse"], "sensor=sparse does not fit: "),
+        ([RUN, "beta=[-1]", "checkpoint=first"], "checkpoint=first must be one of best, last"),
+        ([RUN, "beta=[-1]", "split=train"], "split=train must be one of evaluation, validation"),
+        ([RUN, "beta=[-1]", "sampled=often"], "sampled=often must be true or false"),
+        ([RUN, "beta=[-1]", "num_maps=0"], "num_maps=0 must be at least 1"),
+        ([RUN, "beta=[-1]", "num_episodes=1.5"], "num_episodes=1.5 must be a whole number"),
+        ([RUN, "beta=[-1]", "out="], "out names no folder: give it one, or leave it out"),
+        ([RUN, "beta=[-1]", "seed=-1"], "seed=-1 must be at least 0"),
+        ([RUN, "beta=[-1]", "num_workers=-3"], "num_workers=-3 is not a number of processes"),
+        ([RUN, "beta=[-1]", "threads=all"], "threads=all must be a whole number or auto"),
+        ([RUN, "beta=[-1]", "device=tpu"], "device=tpu is not supported"),
+        ([RUN, "beta=[-1]", "map=moon"], "map=moon does not exist: choose one of "),
+        ([RUN, "beta=[-1]", "task.episode_steps=3"], "task.episode_steps needs a choice of task: add task=<name>"),
+        (
+            [RUN, "beta=[-1]", "num_maps=2", "record=true", "video.map=2"],
+            "video.map=2 is not among the 2 evaluated: lower it, or raise num_maps",
+        ),
+        ([RUN, "beta=[-1]", "video.episode=-1"], "video.episode=-1 must be at least 0"),
+        ([RUN, "beta=[-1]", "video.fps=0"], "video.fps=0 must be above 0 and at most 120"),
+        ([RUN, "beta=[-1]", "algo=sac"], "there is no key algo"),
+        ([RUN, "beta=[-1]", "+algo=sac"], "there is no key algo"),
+        ([RUN, "bta=[-1]"], "there is no key bta: did you mean beta?"),
+        (
+            [RUN, "beta=[-1]", "beta_controller=[clearance]"],
+            "beta_controller=[clearance] turns beta between the values of beta: give two or more of them",
+        ),
+        ([RUN, "beta=[-2,-1]", "beta_controller=[bandit,bandit]"], "beta_controller=bandit is given more than once"),
+        (
+            [RUN, "beta=[-2,-1]", "beta_controller=[mood]"],
+            "beta_controller=['mood'] must be a list of some of clearance, tail_variance, bandit in brackets or null",
+        ),
+        (
+            [RUN, "beta=[-2,-1]", "controller.near_m=2"],
+            "controller.near_m=2 must be above 0 and below controller.far_m=1.2",
+        ),
+        ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
+        ([RUN, "beta=[-2,-1]", "controller.step_size=0"], "controller.step_size=0 must be above 0"),
+        ([RUN, "beta=[-2,-1]", "controller.exploration=2"], "controller.exploration=2 must be from 0 to 1"),
+        (["baseline=random"], "baseline=random must be pursuit or null"),
+        (["baseline=pursuit", "beta=[-1]"], "baseline=pursuit has neither beta nor collision weight: leave them out"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_evaluate_refuses(refusal: Callable, tiny_run: Path, arguments: list[str], sentence: str) -> None:
+    given = [f"run={tiny_run}" if argument == RUN else argument for argument in arguments]
+    assert refusal(evaluate.main, given).startswith(sentence)
+
+
+def test_evaluate_refuses_an_out_that_is_a_file(refusal: Callable, tiny_run: Path) -> None:
+    told = refusal(evaluate.main, [f"run={tiny_run}", "beta=[-1]", f"out={tiny_run / 'config.yaml'}"])
+    assert told.endswith("is not a folder: give another with out=<folder>")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a: [1", "while parsing a flow sequence"),
+        ("- 1\n- 2", "it holds no keys"),
+        ("seed: 0", "no algorithm chosen"),
+        ("algo: {name: x}\nsede: 0", "there is no key sede"),
+    ],
+)
+def test_evaluate_refuses_a_run_it_cannot_read(
+    refusal: Callable, tmp_path_factory: pytest.TempPathFactory, text: str, reason: str
+) -> None:
+    folder = tmp_path_factory.mktemp("damaged")
+    (folder / "config.yaml").write_text(text)
+    told = refusal(evaluate.main, [f"run={folder}", "beta=[-1]"])
+    assert told.startswith(f"{folder / 'config.yaml'} cannot be read ({reason}")
+
+
+# ------------------------------------------------------------------------------------------------ composing
+def test_compose_is_what_the_command_line_makes() -> None:
+    cfg = compose("train", [POW, "seed=3", "learner.gamma=0.5"])
+    assert (cfg.algo.name, cfg.seed, cfg.learner.gamma) == ("rcdsac_pow", 3, 0.5)
+    with pytest.raises(UserInputError, match=r"did you mean learner\.gamma"):
+        compose("train", [POW, "learner.gama=0.5"])
+
+
+def test_choices_are_the_files_of_a_group() -> None:
+    assert choices("sensor") == ["full", "narrow", "sparse"]
+    assert choices("no such group") == []
+
+
+def test_a_multirun_checks_every_combination() -> None:
+    seen = []
+    precheck("train", ["-m", "+algo=sac,rcwr", "seed=0,1"], lambda cfg: seen.append((cfg.algo.name, cfg.seed)))
+    assert seen == [("sac", 0), ("sac", 1), ("rcwr", 0), ("rcwr", 1)]
+
+
+@pytest.mark.parametrize("flag", ["--help", "--hydra-help", "--cfg=job", "--info=all"])
+def test_what_only_shows_something_is_left_to_hydra(flag: str) -> None:
+    def never(cfg: object) -> None:
+        raise AssertionError("checked")
+
+    precheck("train", [flag], never)
+
+
+# ------------------------------------------------------------------------------------------------ whole processes
+def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", *arguments],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+
+
+def test_a_refusal_of_the_real_program(tmp_path: Path) -> None:
+    process = start(tmp_path, "rcdsac_trl.train", POW, "learner.batch_size=abc")
+    out, err = process.communicate(timeout=300)
+    assert (process.returncode, out) == (2, "")
+    assert err == "rcdsac_trl: learner.batch_size=abc must be a whole number\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else(
+    tiny_run: Path, tmp_path: Path
+) -> None:
+    given = [f"run={tiny_run}", "beta=[-2,-1]"]
+    here = tiny.evaluate(*given, f"out={tmp_path / 'here'}")
+    cwd = tmp_path / "cwd"
+    cwd.mkdir()
+    sizes = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1"]
+    process = start(cwd, "rcdsac_trl.evaluate", *given, *sizes, "out=there")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err
+    assert "Traceback" not in err
+    assert "collisions_mean" in out
+    assert out.endswith("written to there\n")
+    assert [path.name for path in cwd.iterdir()] == ["there"]
+    for name in ("episodes.csv", "summary.csv", "evaluation.json"):
+        assert (cwd / "there" / name).read_bytes() == (here / name).read_bytes()
+
+
+def interrupt(folder: Path, *arguments: str) -> tuple[int, str]:
+    """Train without end, press Ctrl-C after the second iteration; return the exit code and stderr."""
+    endless = [*TINY, "schedule.iterations=100000", "validation.every_iterations=100000", *arguments]
+    process = start(folder, "rcdsac_trl.train", POW, *endless, f"hydra.run.dir={folder / 'run'}")
+    log = folder / "run" / "train.log"
+    deadline = time.monotonic() + 300
+    while process.poll() is None and time.monotonic() < deadline:
+        if log.exists() and "   2/100000" in log.read_text():  # the first one is saved then
+            break
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the whole group, workers included
+    _, err = process.communicate(timeout=300)
+    return process.returncode, err
+
+
+def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -> None:
+    code, err = interrupt(tmp_path)
+    assert code == 130
+    assert "Traceback" not in err
+    assert err.splitlines()[-1] == "rcdsac_trl: interrupted"
+    run = tmp_path / "run"
+    assert load_progress(run / "checkpoints", "last").updates >= 2
+    assert f" are saved, resume={run} continues there" in (run / "train.log").read_text()
+    assert (run / "training_episodes.csv").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "processes",
+    [
+        ["collector=single", "world.num_workers=2"],
+        ["collector.num_processes=2"],
+        ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"],
+        ["collector=ray", "collector.num_processes=2"],
+    ],
+    ids=["workers", "teams", "validation", "ray"],
+)
+def test_ctrl_c_with_processes(tmp_path: Path, processes: list[str]) -> None:
+    code, err = interrupt(tmp_path, *processes)
+    assert code == 130
+    assert "Traceback" not in err
+    assert load_progress(tmp_path / "run" / "checkpoints", "last").updates >= 2

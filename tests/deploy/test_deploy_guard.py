@@ -1,0 +1,169 @@
+"""Speed limit and stop zone: closed forms on plain scenes, and no collision in any scene, whatever is commanded."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rcdsac_trl.deploy import Guard, PathFollower, Sectors
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import clip_command
+from rcdsac_trl.world.sim.lidar import sector_distances
+from robots import agent
+
+ALL = np.ones(180, dtype=np.bool_)
+OPEN = Sectors(np.full(180, np.inf), ALL)
+NO_SEGMENTS, NO_CIRCLES = np.empty((0, 4)), np.empty((0, 3))
+
+
+def wall_at(x: float) -> Sectors:
+    """A long wall across the way."""
+    return Sectors(sector_distances(0.0, 0.0, 0.0, np.array([[x, -9.0, x, 9.0]]), NO_CIRCLES), ALL)
+
+
+def test_the_limits_hold_and_are_told() -> None:
+    guard = Guard(max_speed_m_per_s=0.3, max_reverse_m_per_s=0.1, max_turn_rad_per_s=0.5)
+    assert guard.limit(0.6, -1.0, OPEN) == (0.3, -0.5, "the speed limit")
+    assert guard.limit(-0.2, 1.0, OPEN) == (-0.1, 0.5, "the speed limit")
+    assert guard.limit(0.3, 0.5, OPEN) == (0.3, 0.5, None)
+
+
+def test_the_way_to_a_wall_is_that_of_reaction_and_braking() -> None:
+    guard = Guard()
+    # At 0.6 m/s: 0.25 s on, then 0.36 / (2 x 1.5) m, less half a step of 0.05 s: the speed falls in steps.
+    way = 0.6 * 0.25 + 0.36 / 3.0 - 0.6 * 0.05 / 2.0
+    needed = guard.radius_m + guard.margin_m + way
+    assert guard.limit(0.6, 0.0, wall_at(needed + 0.01), (0.6, 0.0)) == (0.6, 0.0, None)
+    v, omega, reason = guard.limit(0.6, 0.7, wall_at(needed - 0.01), (0.6, 0.0))
+    assert (omega, reason) == (0.7, "the stop zone")
+    assert v < 0.6
+    assert guard.limit(0.6, 0.0, wall_at(0.31))[0] == 0.0
+    assert guard.limit(-0.2, 0.0, wall_at(0.31)) == (-0.2, 0.0, None)  # away from it
+
+
+def test_beside_a_wall_it_may_go_along_and_away_but_not_nearer() -> None:
+    beside = Sectors(sector_distances(0.0, 0.0, 0.0, np.array([[-9.0, 0.27, 9.0, 0.27]]), NO_CIRCLES), ALL)
+    assert Guard().limit(0.4, -0.5, beside)[0] == 0.4
+    v, omega, reason = Guard().limit(0.4, 0.5, beside, (0.4, 0.5))
+    assert (omega, reason) == (0.5, "the stop zone")
+    assert v < 0.4
+
+
+def test_it_drives_blind_neither_way_unless_told_to() -> None:
+    ahead = Sectors(np.full(180, np.inf), (np.arange(180) < 21) | (np.arange(180) >= 158))
+    assert Guard().limit(-0.2, 0.3, ahead) == (0.0, 0.3, "nothing senses what lies behind")
+    assert Guard(blind_reverse=True).limit(-0.2, 0.3, ahead) == (-0.2, 0.3, None)
+    behind = Sectors(ahead.distances_m, ~ahead.covered)
+    assert Guard().limit(0.2, 0.0, behind) == (0.0, 0.0, "nothing senses what lies ahead")
+
+
+def free_distance(x: float, y: float, segments: np.ndarray, circles: np.ndarray) -> float:
+    return float(sector_distances(x, y, 0.0, segments, circles).min())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_no_command_drives_into_what_is_sensed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    segments = rng.uniform(-3, 3, (6, 4))
+    circles = np.column_stack([rng.uniform(-3, 3, (10, 2)), rng.uniform(0.02, 0.3, 10)])
+    guard = Guard()
+    if free_distance(0.0, 0.0, segments, circles) < guard.radius_m + guard.margin_m:
+        return
+    x = y = yaw = v = omega = 0.0
+    wanted = (0.0, 0.0)
+    for step in range(150):
+        if step % 5 == 0:  # a driver who holds on to what hurts for a while
+            wanted = float(rng.choice([0.6, 0.6, -0.2, rng.uniform(-0.2, 0.6)])), float(rng.uniform(-1.57, 1.57))
+        seen = Sectors(sector_distances(x, y, yaw, segments, circles), ALL)
+        command = guard.limit(*wanted, seen, (v, omega))[:2]
+        for _ in range(7):
+            v, omega = clip_command(*command, v, omega)
+            yaw += omega * 0.02
+            x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
+            assert free_distance(x, y, segments, circles) > guard.radius_m
+
+
+def plain_limit(guard: Guard, v: float, sectors: Sectors, omega: float, moving: tuple[float, float]) -> float:
+    """Return the linear velocity that the stop zone leaves: share by share, place by place, each sector's borders."""
+    angles = np.arange(181) * math.pi / 90.0
+    directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    seen = np.isfinite(sectors.distances_m)
+    for share in (1.0, 0.75, 0.5, 0.25):
+        clearances = []
+        for place in plain_way(share * v, omega, moving, guard.reaction_s):
+            gaps = [math.inf]
+            for borders in (directions[:-1], directions[1:]):
+                along = np.maximum(borders @ place, sectors.distances_m)[seen]
+                gaps.extend(np.hypot(*(place - along[:, None] * borders[seen]).T))
+            clearances.append(min(gaps) - guard.radius_m)
+        needed = min(guard.margin_m, max(clearances[0] - 0.01, 0.01), clearances[0])
+        if min(clearances) >= needed:
+            return share * v
+    return 0.0
+
+
+def plain_way(v: float, omega: float, moving: tuple[float, float], reaction_s: float) -> list[tuple[float, float]]:
+    """Return the places of a way, by the motors' own rule in steps of 0.05 s."""
+    x = y = yaw = 0.0
+    places, step = [(x, y)], 0
+    while step < round(reaction_s / 0.05) or abs(moving[0]) > 1e-9:
+        moving = clip_command(*((v, omega) if step < round(reaction_s / 0.05) else (0.0, 0.0)), *moving, 0.05)
+        middle = yaw + moving[1] * 0.025
+        x, y = x + moving[0] * 0.05 * math.cos(middle), y + moving[0] * 0.05 * math.sin(middle)
+        yaw += moving[1] * 0.05
+        places.append((x, y))
+        step += 1
+    return places
+
+
+@pytest.mark.parametrize("guard", [Guard(), Guard(margin_m=0.2, reaction_s=0.4), Guard(margin_m=0.0, radius_m=0.1)])
+def test_it_decides_as_the_definition_says(guard: Guard) -> None:
+    rng = np.random.default_rng(3)
+    decided = set()
+    for _ in range(300):
+        nearest = guard.radius_m + rng.uniform(0.0, guard.margin_m + 0.5 * guard.reaction_s + 0.1)
+        there = rng.random(180) < rng.uniform(0.0, 0.3)
+        sectors = Sectors(np.where(there, rng.uniform(nearest, nearest + 0.4, 180), np.inf), ALL)
+        (v, omega), moving = rng.uniform((-0.2, -1.5), (0.6, 1.5)), rng.uniform((-0.3, -1.5), (0.8, 1.5))
+        expected = plain_limit(guard, v, sectors, omega, moving)
+        assert guard.limit(v, omega, sectors, moving)[0] == expected
+        decided.add(round(expected / v, 2))
+    assert decided == {0.0, 0.25, 0.5, 0.75, 1.0}
+
+
+@pytest.mark.parametrize("bad", [{"max_speed_m_per_s": -1.0}, {"margin_m": math.nan}, {"radius_m": 0.0}])
+def test_what_is_no_limit_is_refused(bad: dict[str, Any]) -> None:
+    with pytest.raises(UserInputError, match=f"{next(iter(bad))}="):
+        Guard(**bad)
+
+
+# ------------------------------------------------------------------------------------------------ the path
+def test_a_path_is_followed_as_in_training() -> None:
+    follower = PathFollower([(0.0, 0.0), (2.0, 0.0), (2.0, 3.0)], agent().config)
+    # The start itself is within 0.5 m, so the corner is next.
+    np.testing.assert_allclose(follower.update((0.0, 0.0, 0.0)), [[2.0, 0.0], [2.0, 3.0]])
+    np.testing.assert_allclose(follower.update((1.4, 0.0, math.pi / 2)), [[0.0, -0.6], [3.0, -0.6]], atol=1e-12)
+    np.testing.assert_allclose(follower.update((1.6, 0.0, 0.0)), [[0.4, 3.0], [0.4, 3.0]])
+    # A waypoint that was passed stays passed.
+    np.testing.assert_allclose(follower.update((1.0, 0.0, 0.0)), [[1.0, 3.0], [1.0, 3.0]])
+    assert not follower.reached
+    assert follower.update((2.0, 2.86, 1.0)) is None
+    assert follower.reached
+    assert follower.update((0.0, 0.0, 0.0)) is None
+
+
+def test_a_dense_path_is_thinned_to_its_corners() -> None:
+    line = np.linspace(0.0, 4.0, 81)
+    path = np.concatenate([np.column_stack([line, 0 * line]), np.column_stack([0 * line + 4.0, line])])
+    follower = PathFollower(path, agent().config)
+    np.testing.assert_allclose(follower.update((0.0, 0.0, 0.0)), [[4.0, 0.0], [4.0, 4.0]])
+
+
+@pytest.mark.parametrize("path", [[], [(0.0, math.nan)], [(0.0, 0.0, 0.0)], "path"])
+def test_what_is_no_path_is_refused(path: Any) -> None:
+    with pytest.raises(UserInputError, match="path"):
+        PathFollower(path, agent().config)

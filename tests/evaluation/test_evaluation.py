@@ -1,0 +1,427 @@
+"""Evaluation: the same maps for everyone, deterministic actions, the same files twice, numbers that add up."""
+
+import json
+import multiprocessing
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from rcdsac_trl.config.algo_settings import AlgoSettings
+from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation import evaluation_run as evaluation
+from rcdsac_trl.evaluation.evaluation_run import EvaluationRun
+from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.rollout import map_evaluator as driver
+from rcdsac_trl.rollout.environments import environment
+from rcdsac_trl.rollout.make_agent import make_average, make_loss
+from rcdsac_trl.rollout.metrics import METRICS
+from rcdsac_trl.rollout.navigation_metrics import TRIP_METRICS
+from rcdsac_trl.rollout.policies import LeanPolicy, PursuitPolicy
+from rcdsac_trl.rollout.worker import Driven, Team
+from rcdsac_trl.storage.checkpoint import Checkpoints, load_weights
+from rcdsac_trl.storage.checkpoint_record import Progress, load_progress
+from rcdsac_trl.training.validation import Snapshot
+from rcdsac_trl.world.task.env import make_env
+from rcdsac_trl.world.task.world_settings import WorldSettings
+from tiny import evaluate, tiny_settings, tiny_trainer
+
+FILES = ("episodes.csv", "summary.csv", "evaluation.json")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+@pytest.fixture(scope="module")
+def run(tiny_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of this module's own, since evaluations write into it."""
+    folder = tmp_path_factory.mktemp("evaluated") / "run"
+    shutil.copytree(tiny_run, folder)
+    return folder
+
+
+# ------------------------------------------------------------------------------------------------ files
+def test_the_same_run_evaluated_twice_gives_identical_files(run: Path, tmp_path: Path) -> None:
+    given = [f"run={run}", "beta=[-2,-1]", "num_maps=2"]
+    first = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
+    torch.manual_seed(7)
+    second = contents(evaluate(*given, f"out={tmp_path / 'b'}"))
+    assert first == second
+    # Over the first files as well, which are its own.
+    assert contents(evaluate(*given, f"out={tmp_path / 'a'}")) == first
+
+
+@pytest.mark.parametrize("sampled", ["false", "true"])
+def test_processes_do_not_change_an_evaluation(run: Path, tmp_path: Path, sampled: str) -> None:
+    given = [f"run={run}", "beta=[-2,-1]", "num_maps=3", f"sampled={sampled}"]
+    alone = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
+    assert contents(evaluate(*given, f"out={tmp_path / 'b'}", "num_workers=2")) == alone
+    assert not multiprocessing.active_children()
+
+
+def test_another_seed_split_or_agent_gives_other_episodes(run: Path, tmp_path: Path) -> None:
+    given = [f"run={run}", "beta=[-1]"]
+    others = {
+        "plain": [],
+        "seed": ["seed=1"],
+        "split": ["split=validation"],
+        "sampled": ["sampled=true"],
+        "beta": ["beta=[-2]"],
+        "map": ["map=static"],
+    }
+    found = {
+        contents(evaluate(*given, *more, f"out={tmp_path / name}"))["episodes.csv"] for name, more in others.items()
+    }
+    assert len(found) == len(others)
+
+
+def test_sampled_actions_repeat_too(run: Path, tmp_path: Path) -> None:
+    given = [f"run={run}", "beta=[-1]", "sampled=true"]
+    first = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
+    assert contents(evaluate(*given, f"out={tmp_path / 'b'}")) == first
+
+
+def test_it_never_mixes_with_what_another_wrote_meanwhile(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    sizes = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1"]
+    later = make_evaluation(compose("evaluate", [f"run={run}", "beta=[-2]", f"out={out}", *sizes]))
+    before = contents(evaluate(f"run={run}", "beta=[-1]", f"out={out}"))
+    with pytest.raises(UserInputError, match="holds the evaluation of something else"):
+        later.run()
+    assert contents(out) == before
+
+
+def test_it_refuses_to_overwrite_another_evaluation(run: Path, tmp_path: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
+    before = contents(out)
+    for other in (["beta=[-2]"], ["beta=[-1]", "seed=1"], ["beta=[-1]", "checkpoint=last"]):
+        with pytest.raises(
+            UserInputError, match="holds the evaluation of something else: give another folder with out="
+        ):
+            evaluate(f"run={run}", *other, f"out={out}")
+    assert contents(out) == before
+
+
+def test_results_go_beside_the_run_unless_told_otherwise(run: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-1]", "seed=5", "checkpoint=last")
+    assert out == run / "evaluation" / "last-evaluation-seed5-1x2-beta_-1"
+    assert contents(out)
+
+
+def test_the_description_says_what_was_measured(run: Path, tmp_path: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-2,-0.5]", f"out={tmp_path / 'out'}")
+    described = json.loads((out / "evaluation.json").read_text())
+    expected = {
+        "agent": "rcdsac_pow",
+        "train_seed": 0,
+        "measure": "pow",
+        "sensor": "narrow",
+        "checkpoint": "best",
+        "split": "evaluation",
+        "seed": 0,
+        "num_maps": 1,
+        "num_episodes": 2,
+        "sampled": False,
+        "conditions": ["beta=-2", "beta=-0.5"],
+    }
+    assert {key: described[key] for key in expected} == expected
+    assert described["map"]["size_m"] == 10
+    assert described["task"]["episode_steps"] == 20
+
+
+def test_nothing_is_written_when_it_is_stopped(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluation, "episode_metrics", stop)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------------------------------------ numbers
+def test_rows_and_summary_add_up(run: Path, tmp_path: Path) -> None:
+    out = evaluate(f"run={run}", "beta=[-1,-2]", "num_maps=2", "num_episodes=3", f"out={tmp_path / 'out'}")
+    episodes, summary = pd.read_csv(out / "episodes.csv"), pd.read_csv(out / "summary.csv")
+    assert list(episodes) == ["beta", "collision_weight", "map", "episode", *METRICS, *TRIP_METRICS]
+    keys = list(episodes[["beta", "map", "episode"]].itertuples(index=False, name=None))
+    assert keys == [(beta, map_, i) for beta in (-2.0, -1.0) for map_ in (0, 1) for i in range(3)]
+    assert summary["beta"].tolist() == [-2.0, -1.0]
+    assert summary["episodes"].tolist() == [6, 6]
+    for _, line in summary.iterrows():
+        of_beta = episodes[episodes["beta"] == line["beta"]]
+        for metric in METRICS:
+            values = of_beta[metric].tolist()
+            mean = sum(values) / 6
+            spread = (sum((value - mean) ** 2 for value in values) / 6) ** 0.5
+            assert line[f"{metric}_mean"] == pytest.approx(mean, rel=1e-4, abs=1e-6)
+            assert line[f"{metric}_std"] == pytest.approx(spread, rel=1e-3, abs=1e-5)
+
+
+def test_fractions_and_counts_are_possible_numbers(run: Path, tmp_path: Path) -> None:
+    episodes = pd.read_csv(evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}") / "episodes.csv")
+    assert (episodes["collisions"] % 1 == 0).all()
+    assert episodes["contact_fraction"].between(0, 1).all()
+    assert (episodes["contact_fraction"] * 20 >= episodes["collisions"] - 1e-6).all()
+    assert episodes["mean_speed_m_per_s"].between(0, 0.7).all()
+
+
+class Hits:
+    """A team whose every agent collides in its second of four steps."""
+
+    def __init__(self, num_agents: int) -> None:
+        self.num_agents = num_agents
+
+    def drive(self, policy: TensorDictModuleBase, episode: int, **asked: Any) -> Driven:
+        assert (asked["observed"], asked["happened"]) == (
+            ("velocity", "pose"),
+            ("contact", "goal_reached", "reward_components"),
+        )
+        policy(TensorDict({"done": torch.zeros(self.num_agents, 1)}, [self.num_agents]))
+        components = np.tile(np.float32([-0.02, 0.0, 0.5, 1.2, 0.0]), (self.num_agents, 4, 1))
+        components[:, 1, 4] = -10.0
+        done = {
+            "contact": components[..., 4:] < 0.0,
+            "goal_reached": components[..., 4:] > 0.0,
+            "reward_components": components,
+            "action": np.zeros((self.num_agents, 4, 2), np.float32),
+        }
+        return Driven({"velocity": np.full((self.num_agents, 5, 4), -0.1, np.float32)}, done, {})
+
+
+class Nothing(TensorDictModuleBase):
+    """Drives nowhere, and notes how actions are chosen."""
+
+    in_keys = ["done"]  # noqa: RUF012
+    out_keys = ["action"]  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kinds: set[Any] = set()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.kinds.add(exploration_type())
+        assert not torch.is_grad_enabled()
+        return tensordict.set("action", torch.zeros(*tensordict.batch_size, 2))
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_table_of_known_episodes(sampled: bool) -> None:
+    conditions = [Condition(collision_weight=2.0), Condition(collision_weight=1.0)]
+    policy, team = Nothing(), Hits(4)
+    table = evaluation.table_of(
+        evaluation.measure_map(team, policy, conditions=conditions, num_agents=2, map_index=map_index, sampled=sampled)
+        for map_index in (2, 0, 1)
+    )
+    assert policy.kinds == {ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC}
+    assert table["map"].tolist() == [0, 0, 1, 1, 2, 2] * 2
+    assert len(table) == 2 * 3 * 2
+    assert table["collision_weight"].tolist() == [1.0] * 6 + [2.0] * 6  # sorted, whatever order was asked for
+    assert table["beta"].isna().all()
+    # 4 x (-0.02 + 0.5 x 1.2) - 10, with a weight of 1 for both conditions: what was paid is not what is reported
+    assert table["reward"].to_numpy() == pytest.approx(4 * 0.58 - 10.0)
+    assert (table["collisions"] == 1).all()
+    assert (table["contact_fraction"] == 0.25).all()
+    assert table["mean_speed_m_per_s"].to_numpy() == pytest.approx(0.1)
+
+
+def told_environment(
+    world: WorldSettings, algo: AlgoSettings | None, conditions: list[Condition], agents: int, memory: int
+) -> EnvBase:
+    """Make an evaluation's agents as an environment that transforms tell what they are told."""
+    return environment(
+        world,
+        algo,
+        split="evaluation",
+        seed=0,
+        agent_ids=list(range(agents)) * len(conditions),
+        memory=memory,
+        conditions=[condition for condition in conditions for _ in range(agents)],
+    )
+
+
+def test_the_weighted_row_is_paid_with_its_weight_and_reported_without(tmp_path: Path) -> None:
+    """RCWR's reward column must compare with every other row's: w_coll is 1 there."""
+    settings = tiny_settings("rcwr")
+    conditions = [Condition(collision_weight=0.5), Condition(collision_weight=2.0)]
+    world = crowded(4)
+    env = told_environment(world, settings.algo, conditions, 2, settings.network.memory)
+    tensordict, kept = env.reset(), []
+    policy = PursuitPolicy()
+    for _ in range(world.task.episode_steps):
+        tensordict = env.step(policy(tensordict))
+        kept.append(tensordict.clone())
+        tensordict = env.step_mdp(tensordict)
+    env.close()
+    steps = torch.stack(kept, 1)
+    weights = torch.tensor([0.5, 0.5, 2.0, 2.0])
+    assert torch.equal(steps["collision_weight"].squeeze(-1), weights.view(4, 1).expand(4, world.task.episode_steps))
+    parts = steps["next", "reward_components"]
+    rest = parts[..., 0] + parts[..., 1] + parts[..., 2] * parts[..., 3]
+    paid = (rest + weights.view(4, 1) * parts[..., 4]).sum(1)
+    torch.testing.assert_close(steps["next", "reward"].squeeze(-1).sum(1), paid, rtol=1e-5, atol=1e-4)
+    collisions = (parts[..., 4] / -10.0).sum(1)
+    assert collisions.sum() > 0, "the map is crowded enough to tell the two rewards apart"
+    reported = evaluation.episode_metrics(steps)["reward"]
+    torch.testing.assert_close(reported.float(), (rest + parts[..., 4]).sum(1), rtol=1e-5, atol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------ who meets what
+def crowded(num_agents: int) -> WorldSettings:
+    """A small world in which a blind controller hits something soon."""
+    cfg = ["map.num_movers=0", "map.clutter_per_m2=0.6", "map.mapped_fraction=0", "task.episode_steps=60"]
+    settings = tiny_settings("rcwr", *cfg)
+    return WorldSettings(settings.map, settings.task, "narrow", num_agents=num_agents, num_workers=0)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_agent_i_of_every_condition_meets_the_same_start(workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
+    settings = tiny_settings("rcdsac_pow")
+    conditions = [Condition(beta=beta) for beta in (-2.0, -1.0, 0.0, -0.5)]
+    agents = 3
+    world = WorldSettings(settings.map, settings.task, "narrow", num_agents=12, num_workers=workers)
+    env = told_environment(world, settings.algo, conditions, agents, settings.network.memory)
+    starts = []
+    for _ in range(2):
+        first = env.reset().reshape(-1)
+        assert first["risk"].flatten().tolist() == [c.beta for c in conditions for _ in range(agents)]
+        blocks = first["pose"].view(len(conditions), agents, 3)
+        assert (blocks == blocks[:1]).all()
+        assert len({tuple(pose) for pose in blocks[0].tolist()}) == agents, "the agents of a block start apart"
+        for key in ("range", "waypoint"):
+            assert (
+                first[key].view(len(conditions), agents, -1) == first[key].view(len(conditions), agents, -1)[:1]
+            ).all()
+        starts.append(blocks[0])
+    assert not torch.equal(*starts), "the next map is another one"
+    env.close()
+
+
+def test_a_run_meets_the_same_episodes_as_the_baseline(run: Path) -> None:
+    settings = tiny_settings()
+    world = WorldSettings(settings.map, settings.task, "narrow", num_agents=2, num_workers=0)
+    poses = []
+    for algo, conditions in ((settings.algo, [Condition(beta=-1.0)]), (None, [Condition()])):
+        env = told_environment(world, algo, conditions, 2, settings.network.memory)
+        poses.append(env.reset()["pose"])
+        env.close()
+    assert torch.equal(*poses)
+
+
+def test_actions_are_tanh_of_the_mean(run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[TensorDictBase] = []
+
+    forward = LeanPolicy.forward
+
+    def watched(self: LeanPolicy, tensordict: TensorDictBase) -> TensorDictBase:
+        out = forward(self, tensordict)
+        seen.append(out.select("loc", "scale", "action").clone())
+        return out
+
+    monkeypatch.setattr(LeanPolicy, "forward", watched)
+    evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'a'}")
+    steps = torch.stack(seen)
+    torch.testing.assert_close(steps["action"], steps["loc"].tanh(), rtol=0, atol=1e-6)
+    seen.clear()
+    evaluate(f"run={run}", "beta=[-1]", "sampled=true", f"out={tmp_path / 'b'}")
+    drawn = torch.stack(seen)
+    noise = (drawn["action"].clamp(-0.999, 0.999).atanh() - drawn["loc"]) / drawn["scale"]
+    assert noise.std().item() == pytest.approx(1.0, abs=0.3)
+
+
+def test_the_named_checkpoint_drives(run: Path, tmp_path: Path) -> None:
+    """Saved weights act: what is saved under a name is what an evaluation under that name measures."""
+    changed = tmp_path / "run"
+    shutil.copytree(run, changed)
+    settings = tiny_settings()
+    loss = make_loss(settings, "cpu")
+    average = make_average(loss, settings.learner)
+    load_weights(changed / "checkpoints", "best", loss=loss, average=average)
+    best_progress = load_progress(changed / "checkpoints", "last")
+    checkpoints = Checkpoints(changed / "checkpoints", {"loss": loss, "average": average}, replay=None, keep=10)
+    checkpoints.save(replace(best_progress, iterations=90), {})
+    given = [f"run={changed}", "beta=[-1]"]
+    best = contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"]
+    assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'same'}"))["episodes.csv"] == best
+    with torch.no_grad():
+        for value in average.module.parameters():
+            value.mul_(2.0)
+    checkpoints.save(replace(best_progress, iterations=91), {})
+    assert contents(evaluate(*given, "checkpoint=last", f"out={tmp_path / 'other'}"))["episodes.csv"] != best
+    assert contents(evaluate(*given, "checkpoint=90", f"out={tmp_path / 'then'}"))["episodes.csv"] == best
+    assert contents(evaluate(*given, f"out={tmp_path / 'best'}"))["episodes.csv"] == best
+
+
+# ------------------------------------------------------------------------------------------------ pursuit, validation
+def test_the_pursuit_baseline_drives_without_any_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    small = ["map=easy", "task=default", "task.episode_steps=120"]
+    out = evaluate("baseline=pursuit", *small)
+    assert out == Path("evaluation") / "pursuit-narrow-evaluation-seed0-1x2"
+    episodes = pd.read_csv(out / "episodes.csv")
+    assert len(episodes) == 2
+    assert episodes[["beta", "collision_weight"]].isna().all(axis=None)
+    assert (episodes["mean_speed_m_per_s"] > 0.25).all(), "it drives"
+    described = json.loads((out / "evaluation.json").read_text())
+    assert (described["agent"], described["measure"], described["checkpoint"]) == ("pursuit", None, None)
+    assert contents(evaluate("baseline=pursuit", *small, "out=again")) == contents(out)
+
+
+def test_a_validation_repeats_itself_and_follows_its_snapshot(tmp_path: Path) -> None:
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "validation.num_maps=2")
+
+    def measured(actor: bytes) -> pd.DataFrame:
+        trainer.validate.start(Snapshot(Progress(), actor), alone=False)
+        return trainer.validate.finish()
+
+    before = trainer.learner.averaged_actor()
+    first = measured(before)
+    with torch.no_grad():
+        for value in trainer.learner.average.module.parameters():
+            value.mul_(3.0)
+    pd.testing.assert_frame_equal(first, measured(before))  # the snapshot stays what it was
+    assert not measured(trainer.learner.averaged_actor())["reward"].equals(first["reward"])
+    trainer.validate.close()
+    trainer.episodes.close()
+    trainer.log.close()
+    trainer.lock.close()
+
+
+def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    built: EvaluationRun = make_evaluation(compose("evaluate", [f"run={run}", "beta=[-1]", f"out={out}"]))
+    assert built.results.path == out
+    assert not out.exists()
+
+
+def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[bool] = []
+    original: Callable[..., Team] = driver.evaluation_team
+
+    def watched(*arguments: Any) -> Team:
+        team = original(*arguments)
+        close = team.close
+        monkeypatch.setattr(team, "close", lambda: (closed.append(True), close()))
+        return team
+
+    monkeypatch.setattr(driver, "evaluation_team", watched)
+    evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
+    assert closed == [True]

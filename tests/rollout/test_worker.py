@@ -1,0 +1,219 @@
+"""Teams drive what the environment and its transforms would have, whoever holds the agents; and their faults."""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.rollout.environments import environment, evaluation_team
+from rcdsac_trl.rollout.make_agent import make_loss, make_policy
+from rcdsac_trl.rollout.make_collector import make_episodes
+from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
+from rcdsac_trl.rollout.worker import Driven, side_by_side
+from rcdsac_trl.rollout.worker_processes import Drive, Request, TeamProcesses
+from rcdsac_trl.storage.checkpoint_record import Progress
+from rcdsac_trl.system.processes import WorkerError
+from rcdsac_trl.world.task.env import make_env
+from rcdsac_trl.world.task.world_settings import WorldSettings
+from tiny import STEPS, tiny_settings
+
+HAPPENED = ("contact", "goal_reached", "reward_components")
+CONDITIONS = {
+    "rcdsac_pow": [Condition(beta=-2.0), Condition(beta=-1.0)],
+    "rcwr": [Condition(collision_weight=0.5), Condition(collision_weight=2.0)],
+}
+
+
+# ------------------------------------------------------------------------------------------------ the same episodes
+def by_transforms(
+    env: EnvBase, policy: TensorDictModuleBase, episode: int, observed: tuple[str, ...], context: list[str]
+) -> TensorDictBase:
+    """Drive an episode through the environment's transforms, a tensordict a step."""
+    tensordict, steps = env.reset(episode=episode), []
+    for _ in range(STEPS):
+        tensordict = env.step(policy(tensordict))
+        kept = [*observed, *context, "action", *(("next", key) for key in (*observed, *HAPPENED))]
+        steps.append(tensordict.select(*kept).flatten())
+        tensordict = env.step_mdp(tensordict)
+    return torch.stack(steps, 1)
+
+
+@pytest.mark.parametrize("row", ["rcdsac_pow", "rcwr", None])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_team_drives_as_the_environment_with_its_transforms(
+    row: str | None, workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
+    settings = tiny_settings(row or "sac", "task.range_noise_std_m=0.1")
+    algo = settings.algo if row else None
+    conditions = CONDITIONS.get(row or "", [Condition()])
+    agents = 4 * len(conditions)
+    world = WorldSettings(settings.map, settings.task, "narrow", num_agents=agents, num_workers=workers)
+    memory, observed = settings.network.memory, ("range", "velocity")
+
+    def policy() -> TensorDictModuleBase:
+        if row is None:
+            return PursuitPolicy()
+        noise = AgentNoise(range(agents))
+        noise.begin(0, "test")
+        return make_policy(make_loss(settings, "cpu").actor_network, noise, "cpu")
+
+    team = evaluation_team(world, algo, conditions, "evaluation", 0, 4, memory)
+    env = environment(
+        world,
+        algo,
+        split="evaluation",
+        seed=0,
+        agent_ids=[0, 1, 2, 3] * len(conditions),
+        memory=memory,
+        conditions=[condition for condition in conditions for _ in range(4)],
+    )
+    context = [] if algo is None or algo.context_key is None else [algo.context_key]
+    one, other = policy(), policy()
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        for episode in (3, 3, 1):
+            found = team.drive(one, episode, observed=observed, happened=HAPPENED).tensordict()
+            expected = by_transforms(env, other, episode, observed, context)
+            assert found.batch_size == expected.batch_size == (agents, STEPS)
+            assert set(found.keys(True, True)) == set(expected.keys(True, True))
+            for key in found.keys(True, True):
+                assert torch.equal(found[key], expected[key]), key
+    team.close()
+    env.close()
+
+
+COLLECTORS = {
+    "one process": ("collector.num_processes=0",),
+    "two": ("collector.num_processes=2",),
+    "single": ("collector=single",),
+    "single of workers": ("collector=single", "world.num_workers=3"),
+}
+AGENTS = 3
+
+
+def collected(row: str, *overrides: str) -> list[TensorDictBase]:
+    """Two iterations' episodes: one driven by pursuit, one by the agent, whose weights have changed meanwhile."""
+    given = [f"world.num_agents={AGENTS}", "learner.sequence_length=2", "task.range_noise_std_m=0.1", *overrides]
+    if not any(each.startswith("collector=") for each in overrides):
+        given.append("collector=multi")
+    settings = tiny_settings(row, *given)
+    actor = make_loss(settings, "cpu").actor_network
+    episodes = make_episodes(settings, actor, "cpu", Progress())
+    batches = []
+    for iteration in range(2):
+        batches.append(episodes.collect(iteration, iteration).clone())
+        with torch.no_grad():
+            for value in actor.parameters():
+                value.mul_(1.5)
+    episodes.close()
+    return batches
+
+
+@pytest.mark.parametrize("row", ["rcdsac_pow", "rcwr"])
+def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
+    first = collected(row, *COLLECTORS["one process"])
+    assert first[0].batch_size == (AGENTS, STEPS)
+    for name in ("two", "single", "single of workers"):
+        for batch, expected in zip(collected(row, *COLLECTORS[name]), first, strict=True):
+            for key in expected.keys(True, True):
+                assert torch.equal(batch[key], expected[key]), (name, key)
+    assert not torch.equal(first[0]["action"], first[1]["action"])
+    assert not multiprocessing.active_children()
+
+
+def test_episodes_are_views_of_what_was_seen() -> None:
+    steps = np.arange(6.0, dtype=np.float32).reshape(1, 6, 1)
+    driven = Driven({"range": steps}, {"action": steps[:, :5], "contact": steps[:, :5]}, {"risk": np.ones((1, 1))})
+    both = side_by_side([driven, driven]).tensordict()
+    assert both["range"][1, :, 0].tolist() == [0, 1, 2, 3, 4]
+    assert both["next", "range"][1, :, 0].tolist() == [1, 2, 3, 4, 5]
+    assert both["risk"].shape == (2, 5, 1)
+    assert set(both["next"].keys()) == {"range", "contact"}
+    one = driven.tensordict()
+    assert one["range"].untyped_storage().data_ptr() == one["next", "range"].untyped_storage().data_ptr()
+
+
+# ------------------------------------------------------------------------------------------------ faults
+FIRST, SECOND = (Request(iteration, map_index=0, weights=b"") for iteration in range(2))
+TIMEOUT_S = 5.0
+
+
+@contextlib.contextmanager
+def answering(seconds: float, does: str) -> Iterator[Drive]:
+    """Answer the first request at once; the second one only after some time, in some way."""
+
+    def drive(request: Request, before_step: Callable[[], None]) -> Driven:
+        until = time.monotonic() + seconds * request.iteration
+        while time.monotonic() < until:
+            time.sleep(0.01)
+            if does == "steps":
+                before_step()
+        if does == "ends" and request == SECOND:
+            os._exit(7)
+        if does == "fails" and request == SECOND:
+            raise ValueError("a mistake")
+        return Driven({}, {"action": np.full((1, 1, 2), os.getpid() % 1000, np.float32)}, {})
+
+    yield drive
+
+
+@pytest.fixture
+def processes() -> Iterator[Callable[..., TeamProcesses]]:
+    """Start processes that have answered once: what starting takes counts for nothing here."""
+    started: list[TeamProcesses] = []
+
+    def start(*makes: Any) -> TeamProcesses:
+        started.append(teams := TeamProcesses(makes, [f"agents {n}" for n in range(len(makes))], None))
+        teams.ask(FIRST)
+        teams._timeout_s = TIMEOUT_S
+        return teams
+
+    yield start
+    for teams in started:
+        teams.close()
+        teams.close()  # once more does no harm
+    assert not multiprocessing.active_children()
+
+
+def test_slow_processes_that_take_steps_do_not_count_as_hung(processes: Callable[..., TeamProcesses]) -> None:
+    teams = processes(*[partial(answering, TIMEOUT_S + 2.0, "steps")] * 2)
+    pids = [process.pid for process in teams._processes]
+    assert teams.ask(SECOND)["action"][:, 0, 0].tolist() == [pid % 1000 for pid in pids]
+
+
+@pytest.mark.parametrize(
+    ("does", "told"),
+    [("ends", "ended with exit code 7"), ("fails", "ended with exit code 1"), ("sleeps", "gave no answer within 5 s")],
+)
+def test_a_process_that_fails_is_named(processes: Callable[..., TeamProcesses], does: str, told: str) -> None:
+    slow = 1000.0 if does == "sleeps" else 0.0
+    teams = processes(partial(answering, 0.0, "steps"), partial(answering, slow, does))
+    with pytest.raises(WorkerError, match=rf"^worker process 2 of 2 \(agents 1\) {told}$"):
+        teams.ask(SECOND)
+
+
+@pytest.mark.parametrize(
+    ("number", "told"), [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "gave no answer within 5 s")]
+)
+def test_a_process_that_cannot_even_be_asked_is_named(
+    processes: Callable[..., TeamProcesses], number: signal.Signals, told: str
+) -> None:
+    teams = processes(*[partial(answering, 0.0, "steps")] * 2)
+    os.kill(teams._processes[0].pid, number)
+    large = SECOND._replace(weights=bytes(10_000_000))  # more than a pipe holds
+    with pytest.raises(WorkerError, match=rf"^worker process 1 of 2 \(agents 0\) {told}$"):
+        teams.ask(large)

@@ -1,0 +1,155 @@
+"""The run folder: what a run was made of, and all that it says while it trains."""
+
+import json
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.rollout.metrics import METRICS
+from rcdsac_trl.system import provenance
+from rcdsac_trl.training.run_log import RunLog, check_backends, start_run_folder
+from tiny import AGENTS, ITERATIONS, STEPS, UPDATES, tiny_cfg
+
+
+def manifest(run: Path) -> dict:
+    values: dict = json.loads((run / "manifest.json").read_text())
+    return values
+
+
+def test_the_manifest_says_what_the_run_is_made_of(tiny_run: Path) -> None:
+    made_of = manifest(tiny_run)
+    assert made_of["seed"] == 0
+    assert made_of["command"] == [Path(sys.argv[0]).stem, *sys.argv[1:]]
+    assert made_of["commit"] == provenance.commit()
+    assert made_of["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert (made_of["device"], made_of["threads"]) == ("cpu", 1)
+    assert made_of["allocator"]
+    for package in ("torch", "torchrl", "tensordict", "pybullet", "numpy", "numba", "hydra-core", "rcdsac-trl"):
+        assert made_of["packages"][package] == version(package)
+
+
+def test_the_resolved_config_is_kept(tiny_run: Path) -> None:
+    config = yaml.safe_load((tiny_run / "config.yaml").read_text())
+    assert config["algo"]["distortion"]["name"] == "pow"
+    assert config["task"]["episode_steps"] == STEPS
+    assert "${" not in (tiny_run / "config.yaml").read_text()
+    assert "hydra" not in config
+
+
+def test_commit_is_that_of_the_checkout_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def git(*arguments: str) -> str:
+        identity = ["-c", "user.name=t", "-c", "user.email=t@t", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(["git", *identity, *arguments], cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    module = tmp_path / "provenance.py"
+    module.write_text("first")
+    monkeypatch.setattr(provenance, "__file__", str(module))
+    assert provenance.commit() == "none", "no checkout at all"
+    git("init", "-q")
+    assert provenance.commit() == "none", "no commit yet"
+    (tmp_path / "other").write_text("")
+    git("add", "other")
+    git("commit", "-qm", "without the module")
+    assert provenance.commit() == "none", "installed into somebody else's checkout"
+    git("add", "provenance.py")
+    git("commit", "-qm", "with it")
+    head = git("rev-parse", "HEAD")
+    assert provenance.commit() == head
+    module.write_text("changed")
+    assert provenance.commit() == head + "+"
+
+
+def test_a_folder_holds_one_run(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "run"
+    start_run_folder(folder, tiny_cfg(), {"device": "cpu"})
+    assert manifest(folder)["device"] == "cpu"
+    written = (folder / "config.yaml").read_bytes()
+    with pytest.raises(UserInputError, match=r"already holds a run: choose another hydra\.run\.dir"):
+        start_run_folder(folder, tiny_cfg("sac"), {})
+    assert (folder / "config.yaml").read_bytes() == written
+
+
+def test_unknown_backends_are_refused() -> None:
+    check_backends(())
+    check_backends(("csv", "tensorboard"))
+    with pytest.raises(UserInputError, match=r"logger\.backends holds 'excel': choose among csv, tensorboard, wandb"):
+        check_backends(("csv", "excel"))
+
+
+EXPECTED_SCALARS = {
+    *(f"train/{metric}{half}" for metric in METRICS for half in ("", "/low_beta", "/high_beta")),
+    *(f"validation/{metric}/{beta}" for metric in METRICS for beta in ("-2", "-1.5", "-1", "-0.5")),
+    "validation/score",
+    *(f"learn/loss_{name}" for name in ("qvalue", "actor", "alpha")),
+    *(f"learn/{name}" for name in ("alpha", "entropy", "td_error", "q_value", "quantile_spread")),
+    "learn/distortion_strength",
+    "learn/learning_rate_share",
+    "learn/updates",
+    "time/elapsed_s",
+    "time/steps_per_s",
+    "time/updates_per_s",
+}
+
+
+def test_csv_and_tensorboard_take_every_scalar_of_every_iteration(tiny_run: Path) -> None:
+    steps = [(iteration + 1) * AGENTS * STEPS for iteration in range(ITERATIONS)]
+
+    scalars = tiny_run / "csv" / "scalars"
+    assert {path.relative_to(scalars).with_suffix("").as_posix() for path in scalars.rglob("*.csv")} == EXPECTED_SCALARS
+    for name in EXPECTED_SCALARS:
+        rows = (scalars / f"{name}.csv").read_text().split()
+        assert [int(row.split(",")[0]) for row in rows] == steps, name
+
+    events = EventAccumulator(str(tiny_run / "tensorboard"))
+    events.Reload()
+    assert set(events.Tags()["scalars"]) == EXPECTED_SCALARS
+    for name in EXPECTED_SCALARS:
+        assert [event.step for event in events.Scalars(name)] == steps, name
+    updates = [event.value for event in events.Scalars("learn/updates")]
+    assert updates == [UPDATES * (i + 1) for i in range(ITERATIONS)]
+
+
+def test_the_log_agrees_with_the_tables(tiny_run: Path) -> None:
+    events = EventAccumulator(str(tiny_run / "tensorboard"))
+    events.Reload()
+    training = pd.read_csv(tiny_run / "training_episodes.csv")
+    validation = pd.read_csv(tiny_run / "validation_episodes.csv")
+    for metric in METRICS:
+        expected = training.groupby("iteration")[metric].mean()
+        assert [e.value for e in events.Scalars(f"train/{metric}")] == pytest.approx(expected.tolist(), abs=1e-4)
+        of_beta = validation[validation["beta"] == -1.5].groupby("iteration")[metric].mean()
+        logged = [e.value for e in events.Scalars(f"validation/{metric}/-1.5")]
+        assert logged == pytest.approx(of_beta.tolist(), abs=1e-4)
+    means = validation.groupby("iteration")[["reward", "collisions", "contact_fraction"]].mean()
+    score = means["reward"] - 10.0 * means["collisions"] - STEPS * means["contact_fraction"]
+    assert [e.value for e in events.Scalars("validation/score")] == pytest.approx(score.tolist(), abs=1e-4)
+
+
+def test_the_console_log_shows_rates_and_every_condition(tiny_run: Path) -> None:
+    text = (tiny_run / "train.log").read_text()
+    for beta in ("-2", "-1.5", "-1", "-0.5"):
+        assert text.count(f" beta={beta} ") == ITERATIONS
+    iterations = [line for line in text.splitlines() if line.lstrip().startswith(tuple("12")) and "reward" in line]
+    assert len(iterations) == ITERATIONS
+    for line in iterations:
+        for word in ("updates", "collisions", "goals", "speed", "contact", "steps/s", "updates/s"):
+            assert word in line
+
+
+def test_tables_grow_under_one_header(tmp_path: Path) -> None:
+    log = RunLog(tmp_path, [])
+    rows = pd.DataFrame({"iteration": [0, 0], "reward": [1 / 3, 2.0]})
+    log.episodes("training", rows)
+    log.episodes("training", rows.assign(iteration=1))
+    log.message("hello")
+    log.close()
+    assert (tmp_path / "training_episodes.csv").read_text() == ("iteration,reward\n0,0.333333\n0,2\n1,0.333333\n1,2\n")
+    assert (tmp_path / "train.log").read_text() == "hello\n"

@@ -1,0 +1,103 @@
+"""A run has its folder to itself: two never meet in one, and one that is refused leaves no trace."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from rcdsac_trl.config.compose import output_folder
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.storage.checkpoint_record import newest
+from tiny import AGENTS, ITERATIONS, TINY, tiny_trainer
+
+START = ["+algo=rcdsac_pow", *TINY]
+
+# Waits where nothing speaks against the folder yet until the other one has come as far.
+STARTER = """
+import sys, time
+from pathlib import Path
+from rcdsac_trl import train
+from rcdsac_trl.training import run_log
+
+mine, other = Path(sys.argv.pop(1)), Path(sys.argv.pop(1))
+check_folder = run_log.check_folder
+
+def checked_by_both(folder):
+    check_folder(folder)
+    mine.touch()
+    while not other.exists():
+        time.sleep(0.01)
+
+run_log.check_folder = checked_by_both
+train.main()
+"""
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_of_two_starts_in_one_folder_one_trains_and_the_other_leaves_no_trace(tmp_path: Path) -> None:
+    run, flags = tmp_path / "run", [tmp_path / "first", tmp_path / "second"]
+    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", STARTER, *map(str, pair), *START, f"seed={seed}", f"hydra.run.dir={run}"],
+            env=os.environ | {"PYTHONPATH": path, "MALLOC_MMAP_MAX_": "0", "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for seed, pair in enumerate((flags, flags[::-1]))
+    ]
+    errors = [process.communicate(timeout=300)[1] for process in started]
+    codes = [process.returncode for process in started]
+    assert sorted(codes) == [0, 2], errors
+    winner, loser = codes.index(0), codes.index(2)
+    assert errors[loser] in (
+        f"rcdsac_trl: {run} is being trained in by another process: wait for it, or stop it\n",
+        f"rcdsac_trl: {run} already holds a run: choose another hydra.run.dir\n",
+    )
+    assert {path.name for path in run.iterdir()} == {
+        "checkpoints",
+        "config.yaml",
+        "lock",
+        "manifest.json",
+        "replay",
+        "train.log",
+        "training_episodes.csv",
+        "validation_episodes.csv",
+    }
+    assert yaml.safe_load((run / "config.yaml").read_text())["seed"] == winner
+    manifest = json.loads((run / "manifest.json").read_text())
+    assert manifest["seed"] == winner
+    assert manifest["overrides"] == [*START, f"seed={winner}"]
+    assert (run / "train.log").read_text().count("iterations; write to") == 1
+    assert len(pd.read_csv(run / "training_episodes.csv")) == AGENTS * ITERATIONS
+    assert newest(run / "checkpoints", replay=run / "replay")[1] == []
+
+
+@pytest.mark.parametrize("left", ["config.yaml", "checkpoints", "training_episodes.csv"])
+def test_a_folder_that_holds_a_part_of_a_run_holds_a_run(tiny_run: Path, tmp_path: Path, left: str) -> None:
+    (tmp_path / left).symlink_to(tiny_run / left)
+    before = files_of(tmp_path)
+    with pytest.raises(UserInputError, match="already holds a run: choose another"):
+        tiny_trainer(tmp_path)
+    assert files_of(tmp_path) == before
+
+
+def test_a_lock_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "lock").mkdir()
+    with pytest.raises(UserInputError, match=rf"^{tmp_path}/lock cannot be opened \(Is a directory\): remove it$"):
+        tiny_trainer(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+
+
+def test_runs_started_in_the_same_second_get_folders_of_their_own() -> None:
+    given = ["+algo=rcdsac_pow"]
+    assert len({output_folder("train", given) for _ in range(3)}) == 3

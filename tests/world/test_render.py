@@ -1,0 +1,133 @@
+"""Frames: shape, and that each thing is drawn where it is and in its colour."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.world import render
+from rcdsac_trl.world.maps.generator import Box, Cylinder, Map, MapSettings
+from rcdsac_trl.world.render import Renderer, Scene
+from rcdsac_trl.world.sim.lidar import sector_distances
+from rcdsac_trl.world.task.env import NavigationEnv
+
+SIZE_M = 20.0
+SIZE_PX = 416  # 20 px/m and 8 px of margin
+MAP = Map(
+    layout="clutter",
+    size_m=SIZE_M,
+    boxes=(
+        Box(10.0, 15.0, 4.0, 0.3, 0.0, mapped=True, wall=True),
+        Box(5.0, 5.0, 0.6, 0.6, 0.5, mapped=True),
+        Box(16.0, 5.0, 0.6, 0.6, 0.0, mapped=False),
+    ),
+    cylinders=(Cylinder(17.0, 12.0, 0.5, mapped=False),),
+    movers=(),
+)
+
+
+def scene(**changes: object) -> Scene:
+    pose = (10.0, 8.0, 0.0)
+    standing = Scene(
+        map=MAP,
+        pose=pose,
+        distances_m=sector_distances(*pose, MAP.segments(), MAP.circles()),
+        sensor_mask=sensor_mask("narrow"),
+        waypoints=np.array([[10.0, 4.0], [3.0, 2.0]]),
+        movers=np.array([[2.0, 17.0, 0.5]]),
+        trail=[(10.0 - 0.1 * k, 8.0) for k in range(30, -1, -1)],
+        in_contact=False,
+    )
+    return dataclasses.replace(standing, **changes)
+
+
+def at(frame: np.ndarray, x: float, y: float) -> np.ndarray:
+    """Return the pixel of a point of the whole-map view."""
+    scale = SIZE_PX / (1.04 * SIZE_M)
+    return frame[int((1.02 * SIZE_M - y) * scale), int((x + 0.02 * SIZE_M) * scale)].astype(int)
+
+
+def test_everything_is_drawn_in_its_place_and_colour() -> None:
+    frame = Renderer(SIZE_PX).draw(scene())
+    assert frame.shape == (SIZE_PX, SIZE_PX, 3)
+    assert frame.dtype == np.uint8
+    for point, color in {
+        (8.0, 15.0): render.WALL,
+        (5.0, 5.0): render.MAPPED,
+        (16.0, 5.0): render.UNMAPPED,
+        (17.0, 12.0): render.UNMAPPED,
+        (2.0, 17.0): render.MOVER,
+        (3.0, 2.0): render.GOAL,
+        (13.5, 17.5): render.FLOOR,
+        (10.0, 8.14): render.ROBOT,
+    }.items():
+        assert at(frame, *point) == pytest.approx(np.array(color), abs=3), point
+    # The upper left corner of the picture lies outside the map.
+    assert frame[1, 1] == pytest.approx(np.array(render.OUTSIDE), abs=3)
+
+
+def test_the_view_of_the_sensor_is_tinted_and_nothing_else() -> None:
+    frame = Renderer(SIZE_PX).draw(scene(trail=[]))
+    ahead, behind = at(frame, 11.5, 8.5), at(frame, 8.5, 8.5)
+    assert behind == pytest.approx(np.array(render.FLOOR), abs=3)
+    assert ahead[2] - ahead[0] > 15  # bluish
+    everywhere = Renderer(SIZE_PX).draw(scene(trail=[], sensor_mask=sensor_mask("full")))
+    assert at(everywhere, 8.5, 8.5) == pytest.approx(ahead, abs=3)
+
+
+def test_contact_trail_and_caption_change_the_picture() -> None:
+    renderer = Renderer(SIZE_PX)
+    plain = renderer.draw(scene())
+    touching = renderer.draw(scene(in_contact=True))
+    assert at(touching, 10.0, 8.14) == pytest.approx(np.array(render.TOUCHING), abs=3)
+    untrailed = renderer.draw(scene(trail=[]))
+    assert np.abs(at(plain, 9.0, 8.0) - at(untrailed, 9.0, 8.0)).max() > 50
+    captioned = renderer.draw(scene(), "β = −1.0")
+    changed = np.argwhere((captioned != plain).any(-1))
+    assert len(changed) > 100
+    assert changed[:, 0].min() > 0.9 * SIZE_PX
+    assert changed[:, 1].max() < 0.4 * SIZE_PX
+
+
+def test_the_same_scene_gives_the_same_frame_whatever_was_drawn_before() -> None:
+    renderer = Renderer(SIZE_PX)
+    first = renderer.draw(scene())
+    other_map = dataclasses.replace(MAP, boxes=())
+    assert not np.array_equal(renderer.draw(scene(map=other_map)), first)
+    assert np.array_equal(renderer.draw(scene()), first)
+
+
+def test_a_close_view_follows_the_robot() -> None:
+    renderer = Renderer(200, view_m=4.0)
+    for pose in ((10.0, 8.0, 0.3), (3.1, 17.2, 0.3), (0.4, 19.6, 0.3)):
+        frame = renderer.draw(scene(pose=pose, trail=[]))
+        assert frame.shape == (200, 200, 3)
+        # White arrow in the middle, robot's green around it: 50 px/m.
+        assert frame[100, 100] == pytest.approx(np.full(3, 255), abs=3)
+        assert frame[100, 91] == pytest.approx(np.array(render.ROBOT), abs=40)
+    # The last pose is in the map's corner, so the picture's corner lies outside.
+    assert frame[2, 2] == pytest.approx(np.array(render.OUTSIDE), abs=3)
+
+
+def test_edges_are_smooth() -> None:
+    frame = Renderer(SIZE_PX, oversampling=3).draw(scene())
+    turned = frame[int((20.4 - 6.0) * 20) : int((20.4 - 4.0) * 20), int(4.4 * 20) : int(6.4 * 20)]
+    assert len(np.unique(turned.reshape(-1, 3), axis=0)) > 20
+
+
+def test_the_environment_draws_its_agents() -> None:
+    settings = MapSettings(size_m=12.0, layouts=("rooms",))
+    env = NavigationEnv(settings, agent_ids=(0, 1))
+    env.reset()
+    frames = [env.render(row) for row in range(2)]
+    assert frames[0].shape == (512, 512, 3)
+    assert not np.array_equal(frames[0], frames[1])
+    env.close()
+
+
+@pytest.mark.parametrize("wrong", [{"size_px": 4}, {"view_m": 0.0}, {"oversampling": 0}])
+def test_what_cannot_be_drawn_is_refused(wrong: dict) -> None:
+    with pytest.raises(UserInputError, match=next(iter(wrong))):
+        Renderer(**wrong)
