@@ -10,9 +10,9 @@ from rcdsac_trl.deploy.policy.beta_controllers import (
     FixedBeta,
     TailVarianceBeta,
 )
-from rcdsac_trl.deploy.policy.checks import InputLimits, Stamps
 from rcdsac_trl.deploy.policy.command import Command, Outlook
 from rcdsac_trl.deploy.policy.guard import Guard
+from rcdsac_trl.deploy.policy.input_checks import InputLimits, Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.deploy.policy.policy import Policy
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights, find_weights, read_weights, shipped_names

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from rcdsac_trl.deploy.policy.checks import Stamps
+from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.deploy.policy.policy import Command, Policy
 from rcdsac_trl.deploy.ros import messages

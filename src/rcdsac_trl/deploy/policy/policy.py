@@ -5,7 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.policy.checks import (
+from rcdsac_trl.deploy.policy.command import Command, Outlook
+from rcdsac_trl.deploy.policy.guard import Guard
+from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
+from rcdsac_trl.deploy.policy.input_checks import (
     BadInputError,
     InputLimits,
     Stamps,
@@ -14,9 +17,6 @@ from rcdsac_trl.deploy.policy.checks import (
     velocity_of,
     waypoints_of,
 )
-from rcdsac_trl.deploy.policy.command import Command, Outlook
-from rcdsac_trl.deploy.policy.guard import Guard
-from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
 from rcdsac_trl.errors import UserInputError

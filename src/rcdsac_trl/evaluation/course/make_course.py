@@ -13,7 +13,7 @@ import rcdsac_trl
 from rcdsac_trl.config.course_settings import CourseSettings
 from rcdsac_trl.config.run_config import course_settings
 from rcdsac_trl.deploy import Guard, Policy, shipped_names
-from rcdsac_trl.deploy.policy.checks import InputLimits
+from rcdsac_trl.deploy.policy.input_checks import InputLimits
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered
 from rcdsac_trl.evaluation.course.course_drive import Conditions, drive_course
