@@ -14,12 +14,13 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 from torchrl.objectives.utils import ValueEstimators
 
-from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
+from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.loss.functional import _quantile_huber_pairwise, quantile_huber_loss, squash
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
 SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -32,7 +33,7 @@ def _seed() -> None:
 
 def make_batch(sequences: int = 3, steps: int = 4, beta: float | None = None) -> TensorDict:
     shape = (sequences, steps + 1)
-    content = {"range": torch.rand(*shape, 180)} | {k: torch.randn(*shape, n) for k, n in OBSERVATIONS.items()}
+    content = {"range": torch.rand(*shape, 180)} | {k: torch.randn(*shape, n) for k, n in VECTOR_OBSERVATIONS.items()}
     content["action"] = 2.0 * torch.rand(*shape, 2) - 1.0
     content["risk"] = torch.full((*shape, 1), beta) if beta is not None else -2.0 * torch.rand(*shape, 1)
     content["next"] = {"reward": torch.randn(*shape, 1), "terminated": torch.rand(*shape, 1) < 0.3}
@@ -44,8 +45,8 @@ def make_loss(kind: str = "rcdsac", number: int = 2, **settings: object) -> Dist
     told = measure if kind == "rcdsac" else None
     critic = "scalar" if kind == "sac" else "quantile"
     loss = DistributionalSACLoss(
-        build_actor(2, OBSERVATIONS, told, SMALL),
-        [build_critic(2, OBSERVATIONS, critic, told, SMALL) for _ in range(number)],
+        build_actor(2, VECTOR_OBSERVATIONS, told, SMALL),
+        [build_critic(2, VECTOR_OBSERVATIONS, critic, told, SMALL) for _ in range(number)],
         measure=measure,
         generator=torch.Generator().manual_seed(3),
         **settings,  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic, build_policy
+from rcdsac_trl.agent.actor import build_actor, build_critic, build_policy
 from rcdsac_trl.agent.kernels import feature_kernels, quantile_kernels, quantile_values
 from rcdsac_trl.agent.kernels.recurrent_kernels import _GatedRecurrence, gated_recurrence
 from rcdsac_trl.agent.networks import (
@@ -25,9 +25,10 @@ from rcdsac_trl.agent.networks import (
 )
 from rcdsac_trl.agent.risk import CVaR, PowerLaw
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
 SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
-VECTORS = {**OBSERVATIONS, "collision_weight": 1}
+VECTORS = {**VECTOR_OBSERVATIONS, "collision_weight": 1}
 
 
 @pytest.fixture(autouse=True)
@@ -255,10 +256,10 @@ def test_actor_and_critics_read_and_write_their_keys() -> None:
     actor = build_actor(2, VECTORS, CVaR(), SMALL)
     assert actor.in_keys == ["range", "waypoint", "velocity", "collision_weight", "risk"]
     assert actor(batch.clone())["loc"].shape == (3, 5, 2)
-    assert build_actor(2, OBSERVATIONS, None, SMALL).in_keys == ["range", "waypoint", "velocity"]
+    assert build_actor(2, VECTOR_OBSERVATIONS, None, SMALL).in_keys == ["range", "waypoint", "velocity"]
     quantile = build_critic(2, VECTORS, "quantile", CVaR(), SMALL)
     assert quantile(batch.clone())["quantiles"].shape == (3, 5, 4)
-    assert "risk" not in build_critic(2, OBSERVATIONS, "quantile", None, SMALL).in_keys
+    assert "risk" not in build_critic(2, VECTOR_OBSERVATIONS, "quantile", None, SMALL).in_keys
     scalar = build_critic(2, VECTORS, "scalar", None, SMALL)
     assert scalar(batch.clone())["state_action_value"].shape == (3, 5, 1)
 

@@ -10,10 +10,11 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
-from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
+from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.networks import Widths
 from rcdsac_trl.agent.risk import PowerLaw
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
 SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -34,8 +35,8 @@ def make_loss(kind: str, per: str) -> DistributionalSACLoss:
     told = PowerLaw() if kind == "rcdsac" else None
     critic = "scalar" if kind == "sac" else "quantile"
     loss = DistributionalSACLoss(
-        build_actor(2, OBSERVATIONS, told, SMALL),
-        [build_critic(2, OBSERVATIONS, critic, told, SMALL) for _ in range(2)],
+        build_actor(2, VECTOR_OBSERVATIONS, told, SMALL),
+        [build_critic(2, VECTOR_OBSERVATIONS, critic, told, SMALL) for _ in range(2)],
         measure=PowerLaw(),
         num_quantiles=5,
         num_target_quantiles=4,
@@ -54,7 +55,7 @@ def make_batch(per: str, kept: slice) -> TensorDict:
     ranges = torch.zeros(*shape, 180, dtype=torch.float64)
     ranges[..., kept] = torch.rand(*shape, 180, dtype=torch.float64)[..., kept]
     content: dict = {"range": ranges}
-    content |= {key: torch.randn(*shape, size, dtype=torch.float64) for key, size in OBSERVATIONS.items()}
+    content |= {key: torch.randn(*shape, size, dtype=torch.float64) for key, size in VECTOR_OBSERVATIONS.items()}
     content["action"] = 2.0 * torch.rand(*shape, 2, dtype=torch.float64) - 1.0
     risk = -2.0 * torch.rand(6, 1 if per == "sequence" else 9, 1, dtype=torch.float64)
     content["risk"] = risk.expand(*shape, 1)

@@ -5,10 +5,11 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
+from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.risk import PowerLaw
 from rcdsac_trl.agent.transforms import Relabel
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 from rcdsac_trl.training.setup import make_replay
 from tiny import tiny_settings
 
@@ -28,7 +29,7 @@ def meta_batch(row: str) -> TensorDict:
 def meta_loss(row: str) -> DistributionalSACLoss:
     """Make the loss of a row on the meta device."""
     algo = tiny_settings(row).algo
-    vectors = OBSERVATIONS | ({} if algo.collision_weight is None else {"collision_weight": 1})
+    vectors = VECTOR_OBSERVATIONS | ({} if algo.collision_weight is None else {"collision_weight": 1})
     with torch.device("meta"):
         actor = build_actor(2, vectors, algo.network_measure)
         critics = [build_critic(2, vectors, algo.critic, algo.network_measure) for _ in range(2)]

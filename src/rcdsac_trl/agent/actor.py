@@ -9,7 +9,6 @@ Public names::
     build_policy(actor, action_spec, generator=None) -> ProbabilisticActor              one step, any batch
         observations, risk, is_init, recurrent_state -> loc, scale, action, ("next", "recurrent_state")
     recurrent_state_primer(memory_size) -> TensorDictPrimer
-    OBSERVATIONS = {"waypoint": 6, "velocity": 4}   vector observations besides "range"
 """
 
 from collections.abc import Mapping
@@ -26,9 +25,8 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from rcdsac_trl.agent.networks import ActorHead, Encoder, QuantileHead, ScalarHead, Widths
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
-#: Name and size of the vector observations every agent reads besides ``range``.
-OBSERVATIONS: dict[str, int] = {"waypoint": 6, "velocity": 4}
 #: What the encoder hands to the heads.
 MEMORY_KEY = "memory"
 #: Where the acting policy keeps its memory between steps.
@@ -41,7 +39,7 @@ def _encoder(vectors: Mapping[str, int], widths: Widths) -> TensorDictModule:
 
 def build_actor(
     action_size: int = 2,
-    vectors: Mapping[str, int] = OBSERVATIONS,
+    vectors: Mapping[str, int] = VECTOR_OBSERVATIONS,
     measure: RiskMeasure | None = None,
     widths: Widths | None = None,
 ) -> TensorDictSequential:
@@ -74,7 +72,7 @@ def build_actor(
 
 def build_critic(
     action_size: int = 2,
-    vectors: Mapping[str, int] = OBSERVATIONS,
+    vectors: Mapping[str, int] = VECTOR_OBSERVATIONS,
     kind: Literal["quantile", "scalar"] = "quantile",
     measure: RiskMeasure | None = None,
     widths: Widths | None = None,

@@ -27,6 +27,9 @@ MAX_RANGE_OBSERVATION = RANGE_OFFSET + math.log10(MAX_RANGE_M)
 WAYPOINT_DISTANCE_LIMITS_M = (0.01, 100.0)
 
 
+VECTOR_OBSERVATIONS: dict[str, int] = {"waypoint": 6, "velocity": 4}
+"""Name and size of every observation of an agent besides ``range``."""
+
 Point = tuple[float, float]
 """x and y in the map frame, m."""
 

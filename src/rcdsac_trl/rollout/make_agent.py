@@ -7,12 +7,13 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule
 
-from rcdsac_trl.agent.actor import OBSERVATIONS, build_actor, build_critic
+from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.loss.target_updates import FusedAverage
 from rcdsac_trl.agent.transforms import Relabel
 from rcdsac_trl.config.learner_settings import LearnerSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 from rcdsac_trl.rollout.policies import AgentNoise, LeanPolicy, OnDevice
 from rcdsac_trl.seeding import torch_seed, torch_stream
 from rcdsac_trl.world.task.spaces import ACTION_SIZE
@@ -70,7 +71,7 @@ def unpacked_loss(settings: TrainingSettings, packed: bytes) -> LossModule:
 def _vectors(settings: TrainingSettings) -> dict[str, int]:
     """Name the vector observations of the networks, and their sizes."""
     weighted = settings.algo.collision_weight is not None
-    return OBSERVATIONS | ({"collision_weight": 1} if weighted else {})
+    return VECTOR_OBSERVATIONS | ({"collision_weight": 1} if weighted else {})
 
 
 def _build_actor(settings: TrainingSettings) -> TensorDictSequential:

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from rcdsac_trl.world.task.rules import COLLISION_REWARD
+from rcdsac_trl.world.task.rules import COLLISION_REWARD, combined
 
 METRICS = ("collisions", "reward", "goals", "mean_speed_m_per_s", "contact_fraction")
 
@@ -37,10 +37,9 @@ def episode_metrics(episodes: TensorDictBase) -> dict[str, Tensor]:
     """
     after = episodes["next"]
     contact = after["contact"].squeeze(-1)
-    base, goal, waypoint, angular, collision = after["reward_components"].double().unbind(-1)
     return {
         "collisions": contact_onsets(contact).sum(1).double(),
-        "reward": (base + goal + waypoint * angular + collision).sum(1),
+        "reward": combined(after["reward_components"].double()).sum(1),
         "goals": after["goal_reached"].squeeze(-1).sum(1).double(),
         "mean_speed_m_per_s": after["velocity"][..., 0].abs().double().mean(1),
         "contact_fraction": contact.double().mean(1),

@@ -16,9 +16,10 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 from rcdsac_trl.seeding import torch_stream
-from rcdsac_trl.world.task.rules import total_reward
-from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES
+from rcdsac_trl.world.task.rules import REWARD_COMPONENTS, total_reward
+from rcdsac_trl.world.task.spaces import ACTION_SIZE
 
 # What o_rng can be where it is not 0: 2.5 + log10(d) for d in (0.01, 3) m.
 RANGE_LOW = 0.5
@@ -106,8 +107,7 @@ def slot_spec(num_bins_kept: int, context_keys: tuple[str, ...]) -> dict[str, tu
     """Return the features and type of every key of a slot; the memory of the replay follows from it."""
     spec = {
         "range": (num_bins_kept, torch.int16),
-        "waypoint": (SPACES["waypoint"].size, torch.float32),
-        "velocity": (SPACES["velocity"].size, torch.float32),
+        **{key: (size, torch.float32) for key, size in VECTOR_OBSERVATIONS.items()},
         "action": (ACTION_SIZE, torch.float32),
         "reward_rest": (1, torch.float32),
         "reward_collision": (1, torch.float32),
@@ -191,11 +191,11 @@ class SequenceReplay:
             raise ValueError(f"episodes of {episodes.shape[-1]} steps, not {self.episode_steps}")
         final = episodes[:, -1]
         components = episodes["next", "reward_components"]
-        collision = components[..., 4:5]
+        collision = components[..., [REWARD_COMPONENTS.index("collision")]]
         rest = torch.from_numpy(total_reward(components.numpy(), collision_weight=0.0)).unsqueeze(-1)
         slots = {
             key: torch.cat([episodes[key], final["next", key].unsqueeze(1)], 1)
-            for key in ("range", "waypoint", "velocity")
+            for key in ("range", *VECTOR_OBSERVATIONS)
         }
         slots["range"] = self.codec.encode(slots["range"])
         for key, value in {"action": episodes["action"], "reward_rest": rest, "reward_collision": collision}.items():
@@ -258,7 +258,7 @@ class SequenceReplay:
         slots = flat.reshape(self.batch_size, self.sequence_slots)
         weight = slots["collision_weight"] if "collision_weight" in self.context_keys else 1.0
         reward = slots["reward_rest"] + weight * slots["reward_collision"]
-        kept = {key: _step_by_step(slots[key]) for key in ("waypoint", "velocity")} | {"action": slots["action"]}
+        kept = {key: _step_by_step(slots[key]) for key in VECTOR_OBSERVATIONS} | {"action": slots["action"]}
         # One value expanded: the loss then knows that a sequence shares it.
         kept |= {key: slots[key][:, :1].expand(-1, self.sequence_slots, -1) for key in self.context_keys}
         return TensorDict(

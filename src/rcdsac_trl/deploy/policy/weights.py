@@ -21,6 +21,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS
 
 FORMAT_VERSION = 1
@@ -33,7 +34,6 @@ SHIPPED = Path(__file__).resolve().parents[2] / "weights"
 Context = Literal["beta", "collision_weight"]
 
 _WIDTHS = ("conv", "range", "vector", "memory", "head", "cosines")
-_VECTORS = {"waypoint": 6, "velocity": 4}
 _ACTION_SIZE = 2
 
 
@@ -102,7 +102,7 @@ class AgentConfig:
     @property
     def vectors(self) -> dict[str, int]:
         """Name and size of the vector observations, in the order in which the encoders read them."""
-        return _VECTORS | ({"collision_weight": 1} if self.context == "collision_weight" else {})
+        return VECTOR_OBSERVATIONS | ({"collision_weight": 1} if self.context == "collision_weight" else {})
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of every tensor of the agent, by name."""

@@ -80,7 +80,7 @@ class NavigationAgent:
     velocities: tuple[float, float, float, float]
     in_contact: bool
     goal_reached: bool
-    reward_components: tuple[float, float, float, float, float]
+    reward_components: tuple[float, ...]
     distances_m: NDArray[np.float64]
 
     def __init__(
@@ -120,7 +120,7 @@ class NavigationAgent:
         self._trail.clear()
         self.in_contact = self.goal_reached = False
         self.velocities = (0.0, 0.0, 0.0, 0.0)
-        self.reward_components = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self.reward_components = (0.0,) * len(rules.REWARD_COMPONENTS)
         self._sense()
 
     def step(self, action: Sequence[float]) -> None:

@@ -7,7 +7,7 @@ functions and keeps the state. What the robot is told and what its actions mean 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,10 +100,14 @@ class TaskSettings:
             raise UserInputError(f"action_delay_steps={self.action_delay_steps} must be 0 or more")
 
 
+REWARD_COMPONENTS = ("base", "goal", "waypoint", "angular", "collision")
+"""The parts of the reward, in the order of :func:`reward_components`; :func:`combined` puts them together."""
+
+
 def reward_components(
     v_c: float, theta_1: float, omega_u: float, in_contact: bool, collided: bool, goal_reached: bool
-) -> tuple[float, float, float, float, float]:
-    """Return the five parts of the reward: base, goal, waypoint, angular, collision.
+) -> tuple[float, ...]:
+    """Return the parts of the reward in the order of :data:`REWARD_COMPONENTS`.
 
     Args:
         v_c: linear velocity measured after the step, m/s.
@@ -125,8 +129,19 @@ def reward_components(
     return BASE_REWARD, goal, waypoint, angular, collision
 
 
+def combined(components: Any, collision_weight: Any = 1.0) -> Any:
+    """Return r = r_base + r_goal + r_waypoint * r_angular + w_coll * r_coll, of whatever type the components have.
+
+    Args:
+        components: array or tensor [..., 5], in the order of :data:`REWARD_COMPONENTS`.
+        collision_weight: w_coll; 1 but for RCWR.
+    """
+    base, goal, waypoint, angular, collision = (components[..., i] for i in range(len(REWARD_COMPONENTS)))
+    return base + goal + waypoint * angular + collision_weight * collision
+
+
 def total_reward(components: ArrayLike, collision_weight: float | NDArray[np.float32] = 1.0) -> NDArray[np.float32]:
-    """Return r = r_base + r_goal + r_waypoint * r_angular + w_coll * r_coll, float32 [...].
+    """Return the reward, float32 [...]; see :func:`combined`.
 
     Args:
         components: [..., 5], from :func:`reward_components`.
@@ -136,9 +151,7 @@ def total_reward(components: ArrayLike, collision_weight: float | NDArray[np.flo
         >>> float(total_reward([0.0, 10.0, 0.5, 0.5, -10.0], collision_weight=2.0))
         -9.75
     """
-    c = np.asarray(components, dtype=np.float32)
-    total = c[..., 0] + c[..., 1] + c[..., 2] * c[..., 3] + collision_weight * c[..., 4]
-    return np.asarray(total, dtype=np.float32)
+    return np.asarray(combined(np.asarray(components, dtype=np.float32), collision_weight), dtype=np.float32)
 
 
 def collision_due(in_contact: bool, was_in_contact: bool, mode: CollisionPenaltyMode) -> bool:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.robot.observation import RANGE_OFFSET, WAYPOINT_DISTANCE_LIMITS_M
+from rcdsac_trl.robot.observation import RANGE_OFFSET, VECTOR_OBSERVATIONS, WAYPOINT_DISTANCE_LIMITS_M
 from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.world.task.rules import REWARD_COMPONENTS
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,7 @@ _FASTEST = 10.0
 _LOG_NEAR, _LOG_FAR = (math.log10(limit) for limit in WAYPOINT_DISTANCE_LIMITS_M)
 
 ACTION_SIZE = 2
-NUM_REWARD_COMPONENTS = 5
-AGENT_OBSERVATIONS = ("range", "waypoint", "velocity")
+AGENT_OBSERVATIONS = ("range", *VECTOR_OBSERVATIONS)
 """What a policy may see; the other keys are for metrics and drawing."""
 
 SPACES: dict[str, Space] = {
@@ -64,7 +64,7 @@ SPACES: dict[str, Space] = {
     "pose": _unlimited(3),
     "contact": _FLAG,
     "goal_reached": _FLAG,
-    "reward_components": _unlimited(NUM_REWARD_COMPONENTS),
+    "reward_components": _unlimited(len(REWARD_COMPONENTS)),
     "reward": _unlimited(1),
 }
 
