@@ -33,7 +33,7 @@ LONGEST = (
     "test_networks",
     "test_benchmarks",
     "test_policies",
-    "test_teams",
+    "test_worker",
     "test_wheel",
     "test_course",
 )

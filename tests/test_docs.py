@@ -1,7 +1,11 @@
 """The documents are true: their Python runs, their commands are accepted, what they name exists."""
 
+import os
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -30,6 +34,39 @@ def texts(pattern: str) -> list[tuple[str, str]]:
 def test_python_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     exec(compile(code, name, "exec"), {})
+
+
+def test_the_reward_term_of_contributing_needs_one_file(tmp_path: Path) -> None:
+    """Write what the example says into a copy of the package, and drive: number of parts and sum follow."""
+    section = re.search(r"^## Add a reward term$(.*?)^## ", (ROOT / "CONTRIBUTING.md").read_text("utf-8"), re.M | re.S)
+    assert section is not None
+    added, names, part, parts, total = re.findall(r"^    (\S.*)$", section[1], re.M)
+    copy = tmp_path / "rcdsac_trl"
+    shutil.copytree(ROOT / "src" / "rcdsac_trl", copy, ignore=shutil.ignore_patterns("__pycache__", "weights"))
+    (copy / "conf").symlink_to(CONF_DIR)
+    rules = copy / "world" / "task" / "rules.py"
+    text = f"from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY\n{rules.read_text('utf-8')}"
+    for start, new in (
+        ("REWARD_COMPONENTS = ", f"{added}\n{names}"),
+        ("    return BASE_REWARD, ", f"    {part}\n    {parts}"),
+        ("    return r[", f"    {total}"),
+    ):
+        text, number = re.subn(rf"^{re.escape(start)}.*$", lambda _, new=new: new, text, flags=re.M)
+        assert number == 1, start
+    rules.write_text(text, "utf-8")
+    program = (
+        "import torch\n"
+        "from rcdsac_trl.world.task.env import make_env\n"
+        "env = make_env(num_workers=0)\n"
+        "after = env.rollout(3, lambda td: td.set('action', torch.tensor([1.0, 0.5]).expand(10, 2)))['next']\n"
+        "parts = after['reward_components']\n"
+        "base, goal, waypoint, angular, collision, calm = parts.unbind(-1)\n"
+        "assert torch.allclose(calm, torch.tensor(0.025))\n"
+        "assert torch.allclose(after['reward'][..., 0], base + goal + waypoint * angular + collision + calm)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def commands() -> list[tuple[str, str]]:
@@ -79,7 +116,9 @@ def test_links_lead_somewhere(name: str, target: str) -> None:
 
 
 def test_named_files_exist() -> None:
-    for name, path in texts(r"`((?:world|agent|pipeline|tests|conf|docs)/[\w/.*-]+)`"):
+    for name, path in texts(
+        r"`((?:system|robot|world|agent|deploy|config|storage|rollout|release|training|evaluation|experiments|report|tests|conf|docs)/[\w/.*-]+)`"
+    ):
         places = (ROOT, ROOT / "src" / "rcdsac_trl")
         exists = any(list(place.glob(path.rstrip("/"))) for place in places)
         assert exists or path == f"conf/algo/{NEW_ROW}.yaml", f"{name} names {path}"

@@ -1,8 +1,10 @@
 """Risk-conditioned distributional soft actor-critic for risk-sensitive navigation, on TorchRL.
 
-Four rooms: :mod:`rcdsac_trl.world` is what exists, :mod:`rcdsac_trl.agent` is what learns,
-:mod:`rcdsac_trl.pipeline` is what happens, and :mod:`rcdsac_trl.deploy` is what leaves, onto a robot. World and
-agent do not know each other: they meet in these keys, each with the shape of one agent's entry.
+Maps become a world (:mod:`rcdsac_trl.world`), the world a TorchRL environment; rollouts
+(:mod:`rcdsac_trl.rollout`) fill a replay (:mod:`rcdsac_trl.storage`), a loss (:mod:`rcdsac_trl.agent`) trains a
+risk-conditioned agent (:mod:`rcdsac_trl.training`), an evaluation (:mod:`rcdsac_trl.evaluation`) measures it on
+unseen maps, and a policy object (:mod:`rcdsac_trl.deploy`) carries it onto a robot. World and agent do not know
+each other: they meet in these keys, each with the shape of one agent's entry.
 
 | key | shape, type | unit, values | written by | read by |
 |---|---|---|---|---|

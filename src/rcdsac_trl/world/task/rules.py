@@ -136,8 +136,8 @@ def combined(components: Any, collision_weight: Any = 1.0) -> Any:
         components: array or tensor [..., 5], in the order of :data:`REWARD_COMPONENTS`.
         collision_weight: w_coll; 1 but for RCWR.
     """
-    base, goal, waypoint, angular, collision = (components[..., i] for i in range(len(REWARD_COMPONENTS)))
-    return base + goal + waypoint * angular + collision_weight * collision
+    r = {name: components[..., i] for i, name in enumerate(REWARD_COMPONENTS)}
+    return r["base"] + r["goal"] + r["waypoint"] * r["angular"] + collision_weight * r["collision"]
 
 
 def total_reward(components: ArrayLike, collision_weight: float | NDArray[np.float32] = 1.0) -> NDArray[np.float32]:
