@@ -389,8 +389,8 @@ def test_a_validation_repeats_itself_and_follows_its_snapshot(tmp_path: Path) ->
     trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "validation.num_maps=2")
 
     def measured(actor: bytes) -> pd.DataFrame:
-        trainer.validate.start(Snapshot(Progress(), actor), alone=False)
-        return trainer.validate.finish()
+        trainer.validation.evaluator.start(Snapshot(Progress(), actor), alone=False)
+        return trainer.validation.evaluator.finish()
 
     before = trainer.learner.averaged_actor()
     first = measured(before)
@@ -399,7 +399,7 @@ def test_a_validation_repeats_itself_and_follows_its_snapshot(tmp_path: Path) ->
             value.mul_(3.0)
     pd.testing.assert_frame_equal(first, measured(before))  # the snapshot stays what it was
     assert not measured(trainer.learner.averaged_actor())["reward"].equals(first["reward"])
-    trainer.validate.close()
+    trainer.validation.close()
     trainer.episodes.close()
     trainer.log.close()
     trainer.lock.close()
