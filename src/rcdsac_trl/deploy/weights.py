@@ -175,6 +175,10 @@ class Weights:
                 raise UserInputError(f"{name} holds numbers that are not finite: this agent cannot drive")
         object.__setattr__(self, "tensors", MappingProxyType(dict(self.tensors)))
 
+    def __reduce__(self) -> tuple[type["Weights"], tuple[AgentConfig, dict[str, NDArray[np.float32]]]]:
+        """Pickle and copy what the views of mappings are of: they themselves cannot be."""
+        return Weights, (self.config, dict(self.tensors))
+
     def part(self, prefix: str) -> dict[str, NDArray[np.float32]]:
         """Return the tensors below a prefix, such as ``"actor.encoder"``, without it."""
         return {name[len(prefix) + 1 :]: value for name, value in self.tensors.items() if name.startswith(f"{prefix}.")}
