@@ -181,6 +181,8 @@ ODD = [
     (iter([2.0] * 180), "are not numbers but object"),
     ({"ranges": 2.0}, "are not numbers but object"),
     (pd.Series([2.0] * 179 + [None], dtype="Float64"), "hold NaN"),
+    (range(10**12), "are 1000000000000, more than 20000000: no sensor gives so many"),
+    (np.broadcast_to(np.float32(2.0), (10**9,)), "are 1000000000, more than 20000000"),
     (Endless([2.0]), ""),
     (Hostile(), ""),
     (type, ""),

@@ -114,6 +114,28 @@ def test_who_is_pushed_back_around_a_corner_goes_around_it_again() -> None:
     assert visited(drive(follower, (1.0, 0.0), length_m=13.0), np.array(path[1:]), RADIUS_M) == 2
 
 
+def test_who_is_carried_away_begins_at_the_nearest_place() -> None:
+    follower = PathFollower([(0.0, 0.0), (60.0, 0.0), (60.0, 60.0), (0.0, 60.0)], CONFIG)
+    assert waypoints(follower, 0.0, 0.0) == [[20.0, 0.0], [40.0, 0.0]]
+    for republished in (False, True):
+        if republished:
+            follower.replan([(0.0, 0.0), (60.0, 0.0), (60.0, 60.0), (0.0, 60.0)])
+        assert waypoints(follower, 50.0, 60.0) == [[30.0, 60.0], [10.0, 60.0]]
+
+
+def test_a_pose_that_is_refused_costs_no_progress() -> None:
+    path = [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0), (0.0, 0.5)]
+    follower = PathFollower(path, CONFIG)
+    for x, y, expected in [(0.0, 0.0, [4.0, 0.0]), (3.8, 0.0, [4.0, 4.0])]:
+        for pose in [(-500.0, 9.0, 0.0), (0.0, 0.0, math.inf), (0.0, 0.0, 180.0)]:
+            with pytest.raises(UserInputError):
+                follower.update(pose)
+        follower.replan([(x + 1e-3, y) for x, y in path])
+        with pytest.raises(UserInputError):
+            follower.update((-500.0, 9.0, 0.0))
+        assert waypoints(follower, x, y)[0] == pytest.approx(expected, abs=2e-3)
+
+
 def test_repeated_poses_and_a_path_of_one_place_are_paths() -> None:
     repeated = [point for point in LOOP for _ in range(3)]
     assert waypoints(PathFollower(repeated, CONFIG), 0.0, 0.0) == [[4.0, 0.0], [4.0, 4.0]]

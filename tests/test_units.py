@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from rcdsac_trl.deploy import (
     CameraPose,
+    ClearanceBeta,
     CloudFilter,
     Guard,
     InputLimits,
@@ -24,7 +25,8 @@ from rcdsac_trl.deploy import (
     scan_sectors,
 )
 from rcdsac_trl.deploy.checks import BadInputError
-from rcdsac_trl.deploy.messages import scan_of, stamp_s
+from rcdsac_trl.deploy.command import Command
+from rcdsac_trl.deploy.messages import scan_of, stamp_s, twist_stamped
 from rcdsac_trl.deploy.poses import PoseWatch
 from rcdsac_trl.errors import UserInputError
 from robots import AHEAD, OPEN, STANDING, agent
@@ -192,6 +194,7 @@ def test_clouds_are_in_metres_and_their_zeros_are_nothing() -> None:
         (lambda: Guard(radius_m=250.0), "radius_m=250 of the guard is above 2"),
         (lambda: Guard(margin_m=50.0), "margin_m=50 of the guard is above 2"),
         (lambda: Guard(reaction_s=250.0), "reaction_s=250 of the guard is above 5"),
+        (lambda: ClearanceBeta(-2.0, 0.0, near_m=400.0, far_m=1200.0), "near_m=400 is beyond the 3 m that agents see"),
     ],
 )
 def test_limits_and_mounts_in_other_units_are_refused(make: Any, told: str) -> None:
@@ -234,6 +237,20 @@ def test_stamps_hold_less_than_a_second_of_nanoseconds() -> None:
         wrong = laser(header=SimpleNamespace(stamp=SimpleNamespace(sec=10, nanosec=nanosec)))
         with pytest.raises(UserInputError, match=f"nanosec={nanosec} is not from 0 to 999999999"):
             stamp_s(wrong)
+
+
+def test_a_command_is_stamped_in_seconds() -> None:
+    def make(name: str) -> Any:
+        vectors = {"linear": SimpleNamespace(x=0.0), "angular": SimpleNamespace(z=0.0)}
+        return SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace()), **vectors)
+
+    command = Command(0.25, -0.5, False, None)
+    message = twist_stamped(command, 12.5, make)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (12, 500_000_000)
+    assert (message.twist.linear.x, message.twist.angular.z) == (0.25, -0.5)
+    for now_s in (NOW_S * 1e9, -1.0, math.nan, None):
+        with pytest.raises(UserInputError, match="give seconds"):
+            twist_stamped(command, now_s, make)  # type: ignore[arg-type]
 
 
 def test_a_pose_in_millimetres_moves_too_fast_and_a_corrected_one_does_not() -> None:

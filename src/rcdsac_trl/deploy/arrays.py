@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError, first_line
 
+# More than any sensor gives: reading them would only cost memory.
+_MOST_NUMBERS = 20_000_000
 # What lists of numbers mostly hold: neither masked nor with a unit.
 _PLAIN = frozenset((float, int, list, tuple, np.float64, np.float32, np.ndarray))
 
@@ -29,7 +31,9 @@ def numbers_of(value: Any, name: str) -> NDArray[np.float64]:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
+        _refuse_masses(value, name)
         array = _array(value, name)
+        _refuse_masses(array, name)
         if array.dtype.kind not in "fiu":
             raise UserInputError(f"{name} are not numbers but {array.dtype}: give floats")
         with np.errstate(over="raise"):  # else what is too large becomes inf, which means that nothing is there
@@ -69,6 +73,12 @@ def _array(value: Any, name: str) -> NDArray[Any]:
         if callable(detach):
             value = detach().cpu()
     return np.asanyarray(value)
+
+
+def _refuse_masses(value: Any, name: str) -> None:
+    number = value.size if isinstance(value, np.ndarray) else len(value) if hasattr(value, "__len__") else 0
+    if number > _MOST_NUMBERS:
+        raise UserInputError(f"{name} are {number}, more than {_MOST_NUMBERS}: no sensor gives so many")
 
 
 def _refuse_unit(value: Any, name: str) -> None:

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from rcdsac_trl.deploy.arrays import numbers_of
 from rcdsac_trl.deploy.policy import Command
 from rcdsac_trl.deploy.scan import Scan, ZeroMeans
-from rcdsac_trl.deploy.sectors import Mount
+from rcdsac_trl.deploy.sectors import Mount, is_finite_number
 from rcdsac_trl.errors import UserInputError
 
 # Drivers count the last angle to the last ray or to the one after it; more is another unit, or number of rays.
 _ANGLE_SLACK_RAYS, _ANGLE_SLACK_SHARE = 2.0, 0.05
+# builtin_interfaces/Time holds whole seconds in 32 bits.
+_LAST_STAMP_S = 2.0**31
 # sensor_msgs/PointField: number of a type to NumPy's.
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -134,7 +136,12 @@ def twist_stamped(command: Command, now_s: float, make: Callable[[str], Any], *,
         now_s: time for the header, s.
         make: returns an empty message of the type with that name; see :func:`rosbags_maker`.
         frame_id: of the header.
+
+    Raises:
+        UserInputError: if the time is not one in seconds that a header can hold.
     """
+    if not (is_finite_number(now_s) and 0.0 <= now_s < _LAST_STAMP_S):
+        raise UserInputError(f"now_s={now_s} is not from 0 to {_LAST_STAMP_S:g}: give seconds")
     message = make("geometry_msgs/msg/TwistStamped")
     nanoseconds = round(now_s * 1e9)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 1_000_000_000)

@@ -18,6 +18,8 @@ _FARTHEST_M = 75.0
 # Beyond these, a path is not in metres, nor a pose; projected coordinates of maps have seven digits.
 _LONGEST_LEG_M, _LONGEST_PATH_M, _LARGEST_COORDINATE_M = 1_000.0, 20_000.0, 1e8
 _LARGEST_YAW_RAD = 4.0 * math.pi
+# A robot that is farther from where it was on its path was carried away, and begins anew at the nearest place.
+_CARRIED_AWAY_M = 20.0
 # A robot that is so many waypoint radii nearer to the part of the path before the leg it is on was pushed back there.
 _PUSHED_BACK = 3.0
 
@@ -92,6 +94,7 @@ class PathFollower:
             UserInputError: if the pose is none, or farther from the path than 75 m.
         """
         x, y, yaw = _checked(pose)
+        _check_near(self._planned or self._line, (x, y))
         if self._planned is not None:
             self._take_over(self._planned, (x, y))
             self._planned = None
@@ -193,14 +196,12 @@ class PathFollower:
     def _advance(self, here: tuple[float, float]) -> None:
         """Find the robot's progress, and the waypoint that is next."""
         line, radius_m = self._line, self._radius_m
-        begin_m = float(line.along_m[max(self._next - 1, 0)])
-        ahead_m = self._along_m + radius_m
+        begin_m, ahead_m = self._around_m()
         along_m, off_m = line.nearest(here, begin_m, ahead_m)
-        if off_m > _FARTHEST_M:
-            raise UserInputError(
-                f"the robot is {off_m:g} m from its path, more than {_FARTHEST_M:g} m: give pose and path in metres, "
-                "in one frame"
-            )
+        if off_m > _CARRIED_AWAY_M:
+            self._join(here)
+            begin_m, ahead_m = self._around_m()
+            along_m, off_m = line.nearest(here, begin_m, ahead_m)
         if off_m > radius_m:
             # Who passes a corner at a distance is twice as far from there to the next leg, along the path.
             along_m, off_m = line.nearest(here, begin_m, ahead_m + 2.0 * (off_m - radius_m))
@@ -217,6 +218,10 @@ class PathFollower:
             self._along_m = max(along_m, float(line.along_m[self._next - 1]))
         return None
 
+    def _around_m(self) -> tuple[float, float]:
+        """Return the stretch of the path on which progress is looked for: the leg, and a little ahead."""
+        return float(self._line.along_m[max(self._next - 1, 0)]), self._along_m + self._radius_m
+
     def _two(self) -> NDArray[np.float64]:
         """Return the next two waypoints in the map frame, [2, 2]: corners, or places on the way to them."""
         along_m, last = self._line.along_m, len(self._line.points) - 1
@@ -227,6 +232,15 @@ class PathFollower:
 
 def _apart(a: NDArray[np.float64] | tuple[float, float], b: NDArray[np.float64] | tuple[float, float]) -> float:
     return math.hypot(a[0] - b[0], a[1] - b[1])
+
+
+def _check_near(line: Polyline, here: tuple[float, float]) -> None:
+    off_m = line.nearest(here, 0.0, line.length_m)[1]
+    if off_m > _FARTHEST_M:
+        raise UserInputError(
+            f"the robot is {off_m:g} m from its path, more than {_FARTHEST_M:g} m: give pose and path in metres, in one "
+            "frame"
+        )
 
 
 def _checked(pose: Any) -> tuple[float, float, float]:
