@@ -238,8 +238,8 @@ def _check_near(line: Polyline, here: tuple[float, float]) -> None:
     off_m = line.nearest(here, 0.0, line.length_m)[1]
     if off_m > _FARTHEST_M:
         raise UserInputError(
-            f"the robot is {off_m:g} m from its path, more than {_FARTHEST_M:g} m: give pose and path in metres, in one "
-            "frame"
+            f"the robot is {off_m:g} m from its path, more than {_FARTHEST_M:g} m: give pose and path in metres, in "
+            "one frame"
         )
 
 
