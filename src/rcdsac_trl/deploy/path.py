@@ -16,7 +16,7 @@ _LOOK_AHEAD_M = 20.0
 # A robot that is farther from its path is in another frame, or in another unit.
 _FARTHEST_M = 75.0
 # Beyond these, a path is not in metres, nor a pose; projected coordinates of maps have seven digits.
-_LONGEST_LEG_M, _LONGEST_PATH_M, _LARGEST_COORDINATE_M = 1_000.0, 20_000.0, 1e8
+_LONGEST_LEG_M, _LONGEST_PATH_M, _LARGEST_COORDINATE_M = 500.0, 20_000.0, 1e8
 _LARGEST_YAW_RAD = 4.0 * math.pi
 # A robot that is farther from where it was on its path was carried away, and begins anew at the nearest place.
 _CARRIED_AWAY_M = 20.0
