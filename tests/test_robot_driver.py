@@ -248,7 +248,7 @@ def test_what_cannot_be_driven_on_is_told(change: dict[str, Any], told: str) -> 
 
 def test_odometry_in_millimetres_is_told_when_the_robot_moves() -> None:
     driver = Driver(Policy(agent()))
-    driver.on_path(path([(0.0, 0.0), (900.0, 0.0)]))
+    driver.on_path(path([(0.0, 0.0), (400.0, 0.0), (400.0, 450.0)]))
     reasons = []
     for step in range(3):
         now = 10.0 + PERIOD_S * step
