@@ -80,6 +80,10 @@ def test_damage_is_refused_in_one_sentence(tmp_path: Path) -> None:
         ("network", {"conv": 0}, "does not give a positive width"),
         ("network", values["network"] | {"head": 9}, "its config.json says float32"),
         ("period_s", [0.1], "not two finite numbers"),
+        ("period_s", [120.0, 160.0], "does not rise within [0, 10]: give seconds"),
+        ("period_s", [0.16, 0.12], "does not rise within"),
+        ("waypoint_radius_m", 500.0, "is not above 0 and at most 20: give metres"),
+        ("goal_radius_m", 0.0, "is not above 0"),
     ]:
         config.write_text(json.dumps(values | {key: value}))
         assert told in refusal(), key

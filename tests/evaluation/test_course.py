@@ -17,9 +17,9 @@ import pytest
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
 from rcdsac_trl.deploy import Policy
+from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
-from rcdsac_trl.deploy.policy.policy import Command
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.deploy.sensors.sectors import Sectors
 from rcdsac_trl.errors import UserInputError

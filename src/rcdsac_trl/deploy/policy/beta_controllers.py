@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, sensor_mask
 
 Array = NDArray[np.floating]
 
@@ -70,7 +70,7 @@ class ClearanceBeta:
         sensor: which sectors count, those that the agent sees.
 
     Raises:
-        UserInputError: unless low is at most high, and near_m below far_m and above 0.
+        UserInputError: unless low is at most high, and near_m below far_m, above 0 and within 3 m.
 
     Example:
         >>> controller = ClearanceBeta(-2.0, 0.0, near_m=0.4, far_m=1.2)
@@ -84,6 +84,8 @@ class ClearanceBeta:
         _check_range(low, high)
         if not 0.0 < near_m < far_m:
             raise UserInputError(f"near_m={near_m:g} and far_m={far_m:g} must be above 0, and near_m below far_m")
+        if near_m > MAX_RANGE_M:
+            raise UserInputError(f"near_m={near_m:g} is beyond the {MAX_RANGE_M:g} m that agents see: give metres")
         self._betas = low, high
         self._limits_m = near_m, far_m
         self._mask = sensor_mask(sensor)

@@ -35,6 +35,8 @@ Context = Literal["beta", "collision_weight"]
 
 _WIDTHS = ("conv", "range", "vector", "memory", "head", "cosines")
 _ACTION_SIZE = 2
+# Beyond these, a file holds milliseconds and millimetres.
+_LONGEST_PERIOD_S, _LARGEST_RADIUS_M = 10.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,15 @@ class AgentConfig:
             if len(pair) != 2 or not all(math.isfinite(number) for number in pair):
                 raise UserInputError(f"{name}={value} is not two finite numbers")
             object.__setattr__(self, name, pair)
+        if not 0.0 <= self.period_s[0] <= self.period_s[1] <= _LONGEST_PERIOD_S:
+            raise UserInputError(
+                f"period_s={self.period_s} does not rise within [0, {_LONGEST_PERIOD_S:g}]: give seconds"
+            )
+        for name in ("waypoint_radius_m", "goal_radius_m"):
+            if not 0.0 < getattr(self, name) <= _LARGEST_RADIUS_M:
+                raise UserInputError(
+                    f"{name}={getattr(self, name)} is not above 0 and at most {_LARGEST_RADIUS_M:g}: give metres"
+                )
         if self.sensor not in SENSORS:
             raise UserInputError(f"sensor={self.sensor!r} does not exist; choose one of {', '.join(sorted(SENSORS))}")
         if self.critic not in ("quantile", "scalar"):
@@ -174,6 +185,10 @@ class Weights:
             if not np.isfinite(tensor).all():
                 raise UserInputError(f"{name} holds numbers that are not finite: this agent cannot drive")
         object.__setattr__(self, "tensors", MappingProxyType(dict(self.tensors)))
+
+    def __reduce__(self) -> tuple[type["Weights"], tuple[AgentConfig, dict[str, NDArray[np.float32]]]]:
+        """Pickle and copy what the views of mappings are of: they themselves cannot be."""
+        return Weights, (self.config, dict(self.tensors))
 
     def part(self, prefix: str) -> dict[str, NDArray[np.float32]]:
         """Return the tensors below a prefix, such as ``"actor.encoder"``, without it."""
