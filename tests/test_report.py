@@ -130,6 +130,18 @@ def test_the_four_formats_hold_every_cell(tmp_path: Path) -> None:
     assert pd.read_csv(tmp_path / "table.csv").shape == shown.shape
 
 
+def test_intervals_over_two_seeds_are_wide_but_hold_nothing_that_cannot_be(tmp_path: Path) -> None:
+    one = evaluate(tmp_path / "a", "rcdsac_pow", {-1.0: 0})
+    two = evaluate(tmp_path / "b", "rcdsac_pow", {-1.0: 1}, train_seed=1)
+    alone, both = (findings.summary(read_episodes(named)).set_index("statistic") for named in ([one], [one, two]))
+    # All maps have the same collisions, so that the seeds alone make the interval: 0 and 1 more, 1.5 ± 12.7 x 0.5.
+    assert tuple(alone.loc["collisions", ["value", "low", "high"]]) == (1.0, 1.0, 1.0)
+    assert both.loc["collisions", "value"] == 1.5
+    assert both.loc["collisions", "low"] == 0.0
+    assert both.loc["collisions", "high"] > 4.0
+    assert tuple(both.loc["collision_free", ["low", "high"]]) == (0.0, 1.0)
+
+
 # ------------------------------------------------------------------------------------------------ refusals
 @pytest.mark.parametrize(
     ("changed", "sentence"),
