@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rcdsac_trl.cores import usable_cores
 from rcdsac_trl.pipeline import runtime
 
 NUM_AGENTS = 10
@@ -18,7 +19,8 @@ NUM_AGENTS = 10
 
 def cores() -> list[int]:
     """Return the cores that this process may use."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return sorted(allowed)[: usable_cores()]
 
 
 def prepare(threads: int = 1) -> None:

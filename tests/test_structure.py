@@ -59,12 +59,13 @@ ARROWS = {
     "errors": set(),
     "seeding": set(),
     "paths": set(),
-    "cores": {"errors"},
+    "cgroups": set(),
+    "cores": {"errors", "cgroups"},
     "interface": {"errors"},
     "world": {"errors", "seeding", "cores", "interface", "world"},
     "agent": {"errors", "seeding", "agent"},
     "deploy": {"errors", "interface", "agent", "deploy"},
-    "pipeline": {"errors", "seeding", "paths", "cores", "interface", "world", "agent", "deploy", "pipeline"},
+    "pipeline": {"errors", "seeding", "paths", "cgroups", "cores", "interface", "world", "agent", "deploy", "pipeline"},
     "report": {"errors", "report"},
 }
 

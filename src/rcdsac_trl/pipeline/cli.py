@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.paths import CONF_DIR
 from rcdsac_trl.pipeline.resources import fault_sentence
-from rcdsac_trl.pipeline.runtime import keep_pages, quiet_libraries
+from rcdsac_trl.pipeline.runtime import bound_threads, keep_pages, quiet_libraries
 from rcdsac_trl.pipeline.typed import unknown_key
 
 Task = Callable[[DictConfig], None]
@@ -94,9 +94,10 @@ def overrides_entry_point(config_name: str) -> Callable[[Callable[[list[str]], N
 
 def _program(started: Callable[[], None]) -> None:
     """Do what a program does, so that a mistake, a fault and Ctrl-C each end it as its users expect."""
-    keep_pages()
-    quiet_libraries()
     try:
+        bound_threads()
+        keep_pages()
+        quiet_libraries()
         started()
     except KeyboardInterrupt:
         print("rcdsac_trl: interrupted", file=sys.stderr)

@@ -9,10 +9,9 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
+from rcdsac_trl import cgroups
 from rcdsac_trl.errors import UserInputError
 
-_MEMINFO = Path("/proc/meminfo")
-_CGROUP = Path("/sys/fs/cgroup")
 _DISK = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -81,17 +80,21 @@ def check_picture(out: Path) -> None:
         raise UserInputError(f"out={out} is a folder: give a file")
 
 
-def available_memory_bytes() -> int | None:
-    """Return how much memory and swap this process can still take; None where the system does not say (not Linux)."""
+def available_memory_bytes(system: Path = cgroups.SYSTEM) -> int | None:
+    """Return how much memory this process can still take: of the machine's with its swap, and of its container's.
+
+    Args:
+        system: holds ``proc`` and ``sys``.
+
+    Returns:
+        None where the system does not say (not Linux).
+    """
     found = []
     with suppress(OSError, KeyError, ValueError):
-        lines = dict(line.split(":", 1) for line in _MEMINFO.read_text().splitlines())
+        lines = dict(line.split(":", 1) for line in (system / "proc/meminfo").read_text().splitlines())
         found.append(sum(int(lines[key].split()[0]) for key in ("MemAvailable", "SwapFree")) * 1024)
-    with suppress(OSError, KeyError, ValueError):  # "max" where there is no limit
-        used = int((_CGROUP / "memory.current").read_text())
-        # Files that were read count as used, but give way.
-        stat = dict(line.split() for line in (_CGROUP / "memory.stat").read_text().splitlines())
-        found.append(int((_CGROUP / "memory.max").read_text()) - used + int(stat["inactive_file"]))
+    if (room := cgroups.memory_room_bytes(system)) is not None:
+        found.append(room)
     return min(found, default=None)
 
 
