@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -401,6 +402,27 @@ def test_available_memory_is_the_least_of_what_the_machine_and_the_container_lea
         resources.check_memory("it", refused, "give up")  # it fits, or nothing is known
     with pytest.raises(UserInputError, match=r"^it: 1.0 MB of memory needed, 1.0 MB available: give up$"):
         resources.check_memory("it", 10**6 + 1, "give up")
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp', '/var/tmp']"),
+            "there is no folder for temporary files: set TMPDIR to one that can be written",
+        ),
+        (
+            OSError("AF_UNIX path too long"),
+            "the folder for temporary files has too long a path (/a/long/one): set TMPDIR to another",
+        ),
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "runs/a"), None),
+    ],
+)
+def test_folders_for_temporary_files_that_do_not_serve_are_named(
+    monkeypatch: pytest.MonkeyPatch, error: OSError, sentence: str | None
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/a/long/one")
+    assert resources.fault_sentence(error) == sentence
 
 
 def torch_allocates_too_much() -> None:

@@ -31,6 +31,8 @@ def fault_sentence(error: BaseException) -> str | None:
         >>> fault_sentence(OSError(errno.ENOSPC, "No space left on device", "runs/a/replay"))
         'the disk is full (runs/a/replay: No space left on device)'
     """
+    if isinstance(error, OSError) and (told := _temporary_fault(str(error))) is not None:
+        return told
     if isinstance(error, OSError) and error.errno in _DISK:
         what = f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror)
         return f"{_DISK[error.errno]} ({what})"
@@ -38,6 +40,15 @@ def fault_sentence(error: BaseException) -> str | None:
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(t in text for t in _NO_MEMORY)):
         told = " ".join(str(error).split())
         return "there is not enough memory" + (f" ({told})" if told else "")
+    return None
+
+
+def _temporary_fault(text: str) -> str | None:
+    """Say what is wrong with the folder for temporary files, through whose sockets processes talk to each other."""
+    if "No usable temporary directory" in text:
+        return "there is no folder for temporary files: set TMPDIR to one that can be written"
+    if "AF_UNIX path too long" in text:
+        return f"the folder for temporary files has too long a path ({tempfile.gettempdir()}): set TMPDIR to another"
     return None
 
 
