@@ -328,3 +328,20 @@ def test_a_run_that_logged_no_time_is_drawn_over_its_updates(tmp_path: Path) -> 
     assert (over_updates, over_minutes) == ([2, 2], [1, 1])
     assert panels[1].lines[0].get_xdata().tolist() == [1, 3]
     assert len(learning_curves({"silent": runs["silent"]}).axes) == 2
+
+
+def test_learning_curves_of_a_run_that_is_training(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    (folder / "csv/scalars/time").mkdir(parents=True)
+    table, clock = folder / "validation_episodes.csv", folder / "csv/scalars/time/elapsed_s.csv"
+    table.write_text("iterat")
+    assert validation_of_runs([folder]) == {}
+    table.write_text("iteration,updates,collisions,reward\n0,200,4,10\n1,400,2,3")  # 30 to be
+    clock.write_text("10000,60\n20000,18")  # 180 to be
+    found = validation_of_runs([folder])["run"]
+    assert found.to_dict("records") == [
+        {"iteration": 0, "updates": 200, "collisions": 4, "reward": 10, "elapsed_s": 60}
+    ]
+    table.write_text("iteration,updates\n0,200,4,10\n1,2,3,4,5\n")
+    with pytest.raises(UserInputError, match=r"run cannot be read \(.*\): leave it out"):
+        validation_of_runs([folder])

@@ -115,6 +115,31 @@ def test_a_killed_search_goes_on_with_the_trial_that_was_lost(trained: Callable)
     made("search.trials=3").run()  # nothing is left to do
 
 
+def test_a_search_whose_journal_was_cut_goes_on(trained: Callable, capsys: pytest.CaptureFixture) -> None:
+    """The disk filled up while the first trial's end was written: that trial is taken up again."""
+    jobs = trained(GOOD)
+    made("search.trials=1").run()
+    journal = Path("multirun/search-mine/optuna.journal")
+    journal.write_bytes(journal.read_bytes()[:-30])
+    more = trained(GOOD, GOOD)
+    again = made("search.trials=2")
+    again.run()
+    assert f"the last line of {journal.absolute()} was cut" in capsys.readouterr().err
+    assert [job.name for job in more] == ["trial-0000", "trial-0002"]
+    assert more[0].overrides == jobs[0].overrides
+    assert [trial.state.name for trial in again.study.trials] == ["FAIL", "COMPLETE", "COMPLETE"]
+
+
+def test_a_row_that_is_being_written_is_worth_nothing_yet(trained: Callable, tmp_path: Path) -> None:
+    write(tmp_path, GOOD)
+    table = tmp_path / "validation_episodes.csv"
+    whole = table.read_bytes()
+    table.write_bytes(whole + b"3,3,,1")  # 1000.0 to be
+    assert made()._values(tmp_path) == {1: 90.0, 2: 180.0, 3: 290.0}
+    table.write_bytes(whole[:8])
+    assert made()._values(tmp_path) == {}
+
+
 def test_storage_may_be_a_database(trained: Callable) -> None:
     trained(GOOD)
     made("search.trials=1", "search.storage='sqlite:///all.db'").run()

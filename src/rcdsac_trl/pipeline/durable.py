@@ -127,7 +127,11 @@ class FolderLock:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             self._file.close()
-            raise UserInputError(f"{folder} is being trained in by another process: wait for it, or stop it") from error
+            if isinstance(error, BlockingIOError):
+                sentence = f"{folder} is being trained in by another process: wait for it, or stop it"
+            else:
+                sentence = f"{folder / 'lock'} cannot be locked ({error.strerror}): choose a folder on another disk"
+            raise UserInputError(sentence) from error
 
     def close(self) -> None:
         """Let others train in the folder."""

@@ -18,13 +18,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pandas as pd
-
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.pipeline.durable import FolderLock
 from rcdsac_trl.pipeline.run_settings import SearchSettings
 from rcdsac_trl.pipeline.sweep import Job, State, execute
 from rcdsac_trl.seeding import torch_seed
+from rcdsac_trl.tables import read_growing
 
 if TYPE_CHECKING:
     import optuna
@@ -112,16 +111,15 @@ class Search:
     def study(self) -> "optuna.Study":
         """Optuna's study, made or loaded."""
         import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
+
+        from rcdsac_trl.pipeline.journal import open_journal
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         settings = self.settings
         self.folder.mkdir(parents=True, exist_ok=True)
-        journal = JournalFileBackend(str(self.folder / "optuna.journal"))
         study = optuna.create_study(
             study_name=settings.name,
-            storage=settings.storage or JournalStorage(journal),
+            storage=settings.storage or open_journal(self.folder / "optuna.journal"),
             direction="maximize",
             load_if_exists=True,
             pruner=optuna.pruners.MedianPruner(
@@ -195,7 +193,7 @@ class Search:
     def _values(self, folder: Path) -> dict[int, float]:
         """Read what each validation of a run is worth, by iterations done."""
         try:
-            rows = pd.read_csv(folder / "validation_episodes.csv").dropna(subset=["collisions", "reward"])
+            rows = read_growing(folder / "validation_episodes.csv").dropna(subset=["collisions", "reward"])
         except (OSError, ValueError, KeyError):  # not there yet, or being written
             return {}
         worth = rows["reward"] - self.settings.collision_cost * rows["collisions"]
