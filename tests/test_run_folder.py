@@ -106,9 +106,7 @@ def test_a_disk_without_locks_is_not_taken_for_another_process(tmp_path: Path, m
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", none)
-    with pytest.raises(
-        UserInputError, match=r"/lock cannot be locked \(No locks available\): choose a folder on"
-    ):
+    with pytest.raises(UserInputError, match=r"/lock cannot be locked \(No locks available\): choose a folder on"):
         FolderLock(tmp_path)
 
 
