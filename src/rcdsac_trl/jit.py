@@ -39,7 +39,7 @@ def njit(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     """
     if function is None:
         return partial(njit, **options)
-    if not Path(function.__code__.co_filename).exists():  # typed in: there is nothing that a later process could read
+    if function.__code__.co_filename.startswith("<"):  # typed in: no later process compiles that again
         return numba.njit(**options)(function)
     try:
         return numba.njit(cache=_NOWHERE not in os.environ, **options)(function)

@@ -5,10 +5,12 @@ is relative. And a line that was cut, as a full disk leaves it, is fatal as soon
 """
 
 import fcntl
+import json
 import os
 import sys
 import time
 from collections.abc import Generator
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -116,13 +118,21 @@ class _Journal(JournalFileBackend):
         self._path = path
 
     def read_logs(self, log_number_from: int) -> Generator[dict[str, Any], None, None]:
-        read = log_number_from
         try:
-            for log in super().read_logs(log_number_from):
-                yield log
-                read += 1
+            yield from super().read_logs(log_number_from)
         except ValueError as error:
+            whole = _readable_lines(self._path)
             raise UserInputError(
-                f"line {read + 1} of {self._path} cannot be read ({first_line(error)}): remove what follows line "
-                f"{read} to go on from there, or choose another search.name"
+                f"line {whole + 1} of {self._path} cannot be read ({first_line(error)}): remove what follows line "
+                f"{whole} to go on from there, or choose another search.name"
             ) from error
+
+
+def _readable_lines(path: Path) -> int:
+    """Count the lines before the first one that cannot be read."""
+    count = 0
+    with suppress(ValueError):
+        for line in path.read_bytes().splitlines():
+            json.loads(line)
+            count += 1
+    return count
