@@ -15,7 +15,7 @@ from rcdsac_trl.config.compose import combinations, compose, output_folder
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.system.resources import fault_sentence
-from rcdsac_trl.system.runtime import keep_pages, quiet_libraries
+from rcdsac_trl.system.runtime import bound_threads, keep_pages, quiet_libraries
 
 Task = Callable[[DictConfig], None]
 
@@ -86,9 +86,10 @@ def overrides_entry_point(config_name: str) -> Callable[[Callable[[list[str]], N
 
 def _program(started: Callable[[], None]) -> None:
     """Do what a program does, so that a mistake, a fault and Ctrl-C each end it as its users expect."""
-    keep_pages()
-    quiet_libraries()
     try:
+        bound_threads()
+        keep_pages()
+        quiet_libraries()
         started()
     except KeyboardInterrupt:
         print("rcdsac_trl: interrupted", file=sys.stderr)

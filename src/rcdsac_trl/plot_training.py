@@ -26,6 +26,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, shades, style
 from rcdsac_trl.rollout.metrics import validation_score
 from rcdsac_trl.system.resources import check_picture
+from rcdsac_trl.tables import read_growing
 from rcdsac_trl.training.run_log import TRAINING_TABLE
 
 PANELS: Mapping[str, str] = {
@@ -149,10 +150,12 @@ def _read_run(folder: Path) -> tuple[str, pd.DataFrame, pd.DataFrame | None, int
 
 def _read_table(path: Path, columns: list[str]) -> pd.DataFrame:
     try:
-        table = pd.read_csv(path)
+        table = read_growing(path)
         if missing := [name for name in columns if name not in table]:
             raise ValueError(f"no column {missing[0]}")
         table = table[columns].astype(float)
+    except pd.errors.EmptyDataError:  # its first line is being written
+        table = pd.DataFrame()
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise UserInputError(f"{path} cannot be read ({reason}): name a run whose tables are whole") from error

@@ -14,6 +14,7 @@ from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.experiments.launchers import LAUNCHERS, read_launcher
 from rcdsac_trl.experiments.make_sweep import make_sweep
 from rcdsac_trl.experiments.sweep import Job, Launcher, Sweep
+from rcdsac_trl.system import cgroups
 from rcdsac_trl.system.cores import SHARE, usable_cores
 from rcdsac_trl.system.processes import resolve_num_workers
 
@@ -152,6 +153,7 @@ def test_every_launcher_has_its_file() -> None:
 
 def test_a_share_of_the_cores_is_what_every_auto_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(cgroups, "processor_quota", lambda: None)
     monkeypatch.delenv(SHARE, raising=False)
     assert usable_cores() == 8
     monkeypatch.setenv(SHARE, "5")

@@ -8,7 +8,15 @@ from PIL import Image
 from rcdsac_trl import draw_maps
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.plot_training import PANELS, best_updates, check, draw_run, learning_curve, validation_curves
+from rcdsac_trl.plot_training import (
+    PANELS,
+    _read_run,
+    best_updates,
+    check,
+    draw_run,
+    learning_curve,
+    validation_curves,
+)
 from rcdsac_trl.rollout.metrics import METRICS
 
 NAN = float("nan")
@@ -125,16 +133,31 @@ def test_refuses_what_it_cannot_draw(run: Path, tmp_path: Path) -> None:
         ("config.yaml", bytes(range(256)), r"config\.yaml cannot be read \(.*decode.*\): name a folder"),
         ("config.yaml", b"algo: 3", r"config\.yaml cannot be read \("),
         ("config.yaml", b"", r"config\.yaml cannot be read \("),
-        ("training_episodes.csv", b"", r"training_episodes\.csv cannot be read \(No columns"),
+        ("training_episodes.csv", b"", r"training_episodes\.csv holds no episode: wait for one"),
+        ("training_episodes.csv", b"updates,rewa", r"training_episodes\.csv holds no episode: wait for one"),
         ("training_episodes.csv", b"a,b\n1,2\n", r"training_episodes\.csv cannot be read \(no column updates"),
         ("training_episodes.csv", bytes(range(256)), r"training_episodes\.csv cannot be read \("),
-        ("validation_episodes.csv", b"updates\n1\n2,3", r"validation_episodes\.csv cannot be read \(Error tokenizing"),
+        (
+            "validation_episodes.csv",
+            b"updates\n1\n2,3\n",
+            r"validation_episodes\.csv cannot be read \(Error token",
+        ),
     ],
 )
 def test_a_damaged_run_is_refused_in_one_sentence(run: Path, name: str, content: bytes, told: str) -> None:
     (run / name).write_bytes(content)
     with pytest.raises(UserInputError, match=told):
         check(compose("plot_training", [f"run={run}"]))
+
+
+def test_a_row_that_is_being_written_is_left_out(run: Path) -> None:
+    """Cut anywhere: a number without its end is another number."""
+    whole = (run / "training_episodes.csv").read_bytes()
+    _, before, _, _ = _read_run(run)
+    lines = whole.splitlines(keepends=True)
+    for kept in range(len(lines[-1])):
+        (run / "training_episodes.csv").write_bytes(b"".join(lines[:-1]) + lines[-1][:kept])
+        pd.testing.assert_frame_equal(_read_run(run)[1], before[:-1])
 
 
 @pytest.mark.parametrize("name", ["training_episodes.csv", "validation_episodes.csv"])

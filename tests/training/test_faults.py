@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -385,22 +386,47 @@ def test_networks_that_do_not_fit_leave_nothing_behind(tmp_path: Path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_available_memory_is_the_least_of_what_the_machine_and_the_group_leave(
+def test_available_memory_is_the_least_of_what_the_machine_and_the_container_leave(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    meminfo = tmp_path / "meminfo"
-    monkeypatch.setattr(resources, "_MEMINFO", meminfo)
-    monkeypatch.setattr(resources, "_CGROUP", tmp_path)
-    assert resources.available_memory_bytes() is None
-    resources.check_memory("it", 10**18, "give up")  # nothing is known, so nothing refused
-    meminfo.write_text("MemTotal: 9000 kB\nMemAvailable:    5000 kB\nSwapFree: 1000 kB\n")
-    assert resources.available_memory_bytes() == 6000 * 1024
-    (tmp_path / "memory.current").write_text("3000000\n")
-    (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 500000\n")
-    (tmp_path / "memory.max").write_text("max\n")
-    assert resources.available_memory_bytes() == 6000 * 1024
-    (tmp_path / "memory.max").write_text("4000000\n")
-    assert resources.available_memory_bytes() == 1_500_000
+    proc, group = tmp_path / "proc", tmp_path / "sys" / "fs" / "cgroup"
+    proc.mkdir()
+    group.mkdir(parents=True)
+    assert resources.available_memory_bytes(tmp_path) is None
+    (proc / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    5000 kB\nSwapFree: 1000 kB\n")
+    assert resources.available_memory_bytes(tmp_path) == 6000 * 1024
+    (group / "memory.current").write_text("3000000\n")
+    (group / "memory.stat").write_text("anon 5\ninactive_file 500000\n")
+    (group / "memory.max").write_text("max\n")
+    assert resources.available_memory_bytes(tmp_path) == 6000 * 1024
+    (group / "memory.max").write_text("4000000\n")
+    assert resources.available_memory_bytes(tmp_path) == 1_500_000
+    for known, refused in ((None, 10**18), (10**6, 999_999)):
+        monkeypatch.setattr(resources, "available_memory_bytes", lambda known=known: known)
+        resources.check_memory("it", refused, "give up")  # it fits, or nothing is known
+    with pytest.raises(UserInputError, match=r"^it: 1.0 MB of memory needed, 1.0 MB available: give up$"):
+        resources.check_memory("it", 10**6 + 1, "give up")
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp', '/var/tmp']"),
+            "there is no folder for temporary files: set TMPDIR to one that can be written",
+        ),
+        (
+            OSError("AF_UNIX path too long"),
+            "the folder for temporary files has too long a path (/a/long/one): set TMPDIR to another",
+        ),
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "runs/a"), None),
+    ],
+)
+def test_folders_for_temporary_files_that_do_not_serve_are_named(
+    monkeypatch: pytest.MonkeyPatch, error: OSError, sentence: str | None
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/a/long/one")
+    assert resources.fault_sentence(error) == sentence
 
 
 def torch_allocates_too_much() -> None:

@@ -18,18 +18,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pandas as pd
-
 from rcdsac_trl.config.experiment_settings import SearchSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.experiments.sweep import Job, State, execute
 from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.storage.atomic import FolderLock
+from rcdsac_trl.tables import read_growing
 
 if TYPE_CHECKING:
     import optuna
 
 _FOLDER = "folder"
+_LOCK = "search.lock"  # held by the search whose trial it is: the training takes its own only seconds later
 _NEIGHBOURS = 3  # trials that must have come as far before a median says anything
 
 
@@ -112,16 +112,15 @@ class Search:
     def study(self) -> "optuna.Study":
         """Optuna's study, made or loaded."""
         import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
+
+        from rcdsac_trl.experiments.journal import open_journal
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         settings = self.settings
         self.folder.mkdir(parents=True, exist_ok=True)
-        journal = JournalFileBackend(str(self.folder / "optuna.journal"))
         study = optuna.create_study(
             study_name=settings.name,
-            storage=settings.storage or JournalStorage(journal),
+            storage=settings.storage or open_journal(self.folder / "optuna.journal"),
             direction="maximize",
             load_if_exists=True,
             pruner=optuna.pruners.MedianPruner(
@@ -155,21 +154,25 @@ class Search:
 
     def _take_up_what_was_lost(self) -> None:
         """Put trials whose process is gone in line again, to go on in their folders."""
-        import optuna
+        from optuna.trial import TrialState
 
-        for trial in self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.WAITING))
+        in_line = {trial.user_attrs.get(_FOLDER) for trial in trials if trial.state == TrialState.WAITING}
+        for trial in trials:
             folder = trial.user_attrs.get(_FOLDER)
-            if folder is None or self._is_alive(self.folder / folder):
+            if trial.state == TrialState.WAITING or folder is None or self._is_alive(self.folder / folder):
                 continue
-            self.study.enqueue_trial(trial.params, user_attrs={_FOLDER: folder})
-            self.study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+            if folder not in in_line:  # else whoever put it there was stopped before it could say so
+                self.study.enqueue_trial(trial.params, user_attrs={_FOLDER: folder})
+            self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
     @staticmethod
     def _is_alive(folder: Path) -> bool:
         if not folder.is_dir():
             return False
         try:
-            FolderLock(folder).close()
+            for name in (_LOCK, "lock"):  # a training that lost its search ends with its checkpoint
+                FolderLock(folder, name).close()
         except UserInputError:
             return True
         return False
@@ -190,12 +193,20 @@ class Search:
                     trial.report(value, iteration)
             return bool(reported) and trial.should_prune()
 
-        return execute(job, should_stop=is_hopeless)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock = FolderLock(folder, _LOCK)
+        except UserInputError as error:  # two searches took it up at the same moment
+            return State("failed", str(error))
+        try:
+            return execute(job, should_stop=is_hopeless)
+        finally:
+            lock.close()
 
     def _values(self, folder: Path) -> dict[int, float]:
         """Read what each validation of a run is worth, by iterations done."""
         try:
-            rows = pd.read_csv(folder / "validation_episodes.csv").dropna(subset=["collisions", "reward"])
+            rows = read_growing(folder / "validation_episodes.csv").dropna(subset=["collisions", "reward"])
         except (OSError, ValueError, KeyError):  # not there yet, or being written
             return {}
         worth = rows["reward"] - self.settings.collision_cost * rows["collisions"]

@@ -9,7 +9,7 @@ import sys
 from contextlib import suppress
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.system.cores import usable_cores
+from rcdsac_trl.system.cores import allowed_cores, usable_cores
 
 # glibc maps and unmaps every large temporary by default, which costs more than the arithmetic on it.
 _GLIBC_KEEPS_PAGES = {
@@ -33,6 +33,19 @@ def keep_pages() -> None:
         return
     with suppress(OSError):
         os.execve(sys.executable, sys.orig_argv, os.environ | _GLIBC_KEEPS_PAGES)
+
+
+def bound_threads() -> None:
+    """Keep OpenMP and BLAS from starting more threads than there are cores to use.
+
+    They count the cores they may run on, and see neither a container's quota nor a share. A user's own number stays.
+
+    Raises:
+        UserInputError: if the share is no number.
+    """
+    cores = usable_cores()
+    if cores < allowed_cores():
+        os.environ.setdefault("OMP_NUM_THREADS", str(cores))
 
 
 def _has_glibc() -> bool:

@@ -15,7 +15,6 @@ Public names::
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from rcdsac_trl.agent.networks import LOG_STD_RANGE, ActorHead, Encoder
+from rcdsac_trl.system.jit import njit
 
 Floats = NDArray[np.float32]
 
@@ -30,7 +30,7 @@ _LOG_STD_LOW, _LOG_STD_HIGH = (np.float32(limit) for limit in LOG_STD_RANGE)
 # As TorchRL's TanhNormal: an action at the very limit has no finite inverse.
 _LARGEST_ACTION = np.float32(1.0 - torch.finfo(torch.float32).resolution)
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @_compiled

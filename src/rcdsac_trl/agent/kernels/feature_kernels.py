@@ -5,17 +5,17 @@ that are silent in the whole batch, such as those a narrow sensor lacks, are lef
 bias of the first and of the second.
 """
 
-import numba
 import numpy as np
 
 from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.system.jit import njit
 
 #: Windows of the second convolution that go through the layers together: their inputs and activations take some 2 MB.
 ROWS_PER_BLOCK = 96 * 43
 # Positions of the first convolution that one of the second sees, its kernel's size; both have stride 2.
 _SEEN = 3
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @_compiled

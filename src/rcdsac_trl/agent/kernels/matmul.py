@@ -20,13 +20,14 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.binding
-import numba
 import numpy as np
 import torch
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import get_cython_function_address, intrinsic
+
+from rcdsac_trl.system.jit import njit
 
 #: BLAS's names of the product of two matrices, by their type.
 ROUTINES = {types.float32: "sgemm", types.float64: "dgemm"}
@@ -63,7 +64,7 @@ def _bind_all() -> str:
 LIBRARY = _bind_all()
 # Bytes, a multiple of which the places of torch's tensors are, too; numba's own arrays begin at half of that.
 _ALIGNMENT = 64
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_compiled = njit(nogil=True, error_model="numpy")
 _intrinsic: Any = intrinsic  # the caller does not pass the first argument, which its type does not say
 
 

@@ -4,18 +4,18 @@ Rows go through all layers, matrix products included, in blocks that stay in the
 have N fractions each; H features, C cosines. What is constant along a sequence has one step.
 """
 
-import numba
 import numpy as np
 
 from rcdsac_trl.agent.kernels.feature_kernels import linear
 from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.system.jit import njit
 
 #: Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
 ROWS_PER_BLOCK = 1024
 
 # A sum over features may be added up in any order, which lets several be added at once. A loop has few arrays: of many
 # the compiler gives up showing that they are apart.
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
 
 
 @_compiled

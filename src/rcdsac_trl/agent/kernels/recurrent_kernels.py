@@ -13,16 +13,17 @@ Public names::
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 import torch
+from numba import types
 from numba.extending import overload
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.system.jit import njit
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"contract"})
 
 # tanh(x) = x P(x^2) / Q(x^2), fitted to 1e-8 of tanh for |x| up to the limit, where float32 has no number left below 1.
 _LIMIT = np.float32(8.5)
@@ -50,7 +51,7 @@ def _compiled_tanh(x: Any) -> Callable[[Any], Any]:
     def exact(x: Any) -> Any:
         return np.tanh(x)
 
-    return rational if x == numba.types.float32 else exact
+    return rational if x == types.float32 else exact
 
 
 # Rows are sliced into gates rather than indexed at an offset: only so does the compiler know that they are contiguous.
