@@ -33,7 +33,7 @@ def texts(pattern: str) -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("name", "code"), texts(r"^```python\n(.*?)^```"))
 def test_python_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, name, "exec"), {})
+    exec(compile(code, name, "exec"), {"__name__": "__main__"})
 
 
 def test_the_reward_term_of_contributing_needs_one_file(tmp_path: Path) -> None:

@@ -357,7 +357,7 @@ def test_a_run_goes_on_with_the_validation_that_was_under_way(tmp_path: Path) ->
     assert rows[["iteration", "updates"]].drop_duplicates().to_numpy().tolist() == [[1, 6], [3, 12], [4, 15]]
 
 
-def test_a_hook_sees_every_iteration_once_it_is_logged_and_saved(tmp_path: Path) -> None:
+def test_a_hook_sees_every_iteration_once_it_is_logged_and_before_it_is_saved(tmp_path: Path) -> None:
     seen: list[tuple[int, int | None, float]] = []
 
     def hook(trainer: Trainer, record: Mapping[str, float]) -> None:
@@ -367,7 +367,7 @@ def test_a_hook_sees_every_iteration_once_it_is_logged_and_saved(tmp_path: Path)
 
     trainer = stub_trainer(tmp_path, [], checkpoint_every=1, on_iteration_end=hook, schedule={"iterations": 3})
     trainer.run()
-    assert seen == [(1, 1, 0.0), (2, 2, 22.0), (3, 3, 44.0)]
+    assert seen == [(1, 0, 0.0), (2, 1, 22.0), (3, 2, 44.0)]
 
 
 def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
@@ -376,8 +376,8 @@ def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
             raise StopTraining("good enough")
 
     events: list[Any] = []
-    stub_trainer(tmp_path, events, checkpoint_every=1, on_iteration_end=stop).run()
-    assert [event[1].iterations for event in kinds(events, "save")] == [0, 1, 2]
+    stub_trainer(tmp_path, events, validate_every=100, on_iteration_end=stop).run()
+    assert [event[1].iterations for event in kinds(events, "save")] == [0, 2]
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
     sentence = f"stopped after 2 iterations (good enough); 2 iterations are saved, resume={tmp_path} continues there"
     assert (tmp_path / "train.log").read_text().splitlines()[-1] == sentence
@@ -388,6 +388,10 @@ def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
     events.clear()
     with pytest.raises(ZeroDivisionError):
         stub_trainer(tmp_path, events, checkpoint_every=1, on_iteration_end=fail).run()
+    sentence = (
+        f"on_iteration_end failed in iteration 0 (ZeroDivisionError:); 0 iterations are saved, resume={tmp_path}"
+    )
+    assert sentence in (tmp_path / "train.log").read_text()
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
 
 

@@ -50,13 +50,18 @@ def given_overrides() -> list[str]:
     return list(HydraConfig.get().overrides.task)
 
 
-def check_training(cfg: DictConfig) -> None:
-    """Read everything, so that what cannot work is refused before anything is written."""
+def check_training(cfg: DictConfig) -> TrainingSettings:
+    """Read everything, so that what cannot work is refused before anything is written.
+
+    Raises:
+        UserInputError: for whatever cannot work, or not on this machine.
+    """
     settings = training_settings(cfg)
     runtime.resolve_device(settings.device)
     run_log.check_backends(settings.logger.backends)
     check_collector(settings)
     _check_memory(settings)
+    return settings
 
 
 def _check_memory(settings: TrainingSettings) -> None:
@@ -125,9 +130,9 @@ def make_trainer(
         on_iteration_end: called after every iteration with the trainer and the iteration's scalars.
 
     Raises:
-        UserInputError: if another process trains in the folder, or it holds a run.
+        UserInputError: as :func:`check_training`, or if another process trains in the folder, or it holds a run.
     """
-    settings = training_settings(cfg)
+    settings = check_training(cfg)
     facts = {
         "overrides": list(overrides),
         "device": runtime.resolve_device(settings.device),

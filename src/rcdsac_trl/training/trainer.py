@@ -24,11 +24,14 @@ from rcdsac_trl.training.run_log import RunLog
 from rcdsac_trl.training.validation import Validation
 
 IterationHook = Callable[["Trainer", Mapping[str, float]], None]
-"""Called with the trainer and the iteration's scalars, as they are logged, when an iteration is logged and saved."""
+"""Called with the trainer and the iteration's scalars when an iteration is logged, before it is saved.
+
+So a run that is killed and continued misses no iteration; one that is done again is told again.
+"""
 
 
 class StopTraining(Exception):
-    """Raised by a hook: the run ends here, as if Ctrl-C had been pressed, but without an error."""
+    """Raised by a hook: the iteration is saved, and the run ends here without an error; it can be continued."""
 
 
 class Trainer:
@@ -90,6 +93,7 @@ class Trainer:
         try:
             self._run()
         except StopTraining as stop:
+            self._save()
             reason = f" ({stop})" if str(stop) else ""
             self.log.message(f"stopped after {self.progress.iterations} iterations{reason}; {self._saved_sentence()}")
         except KeyboardInterrupt:
@@ -127,10 +131,25 @@ class Trainer:
                 self.progress = replace(self.progress, elapsed_s=record["time/elapsed_s"])
                 self.log.scalars(record, self.progress.steps)
                 self.log.progress(iteration, total, self.progress.updates, record, bar)
+                self._tell(record)
                 if self._is_saved_now():
                     self._save()
-                if self.on_iteration_end is not None:
-                    self.on_iteration_end(self, record)
+
+    def _tell(self, record: Mapping[str, float]) -> None:
+        """Call the hook; a mistake in it ends the run with its traceback, and the log says what is saved."""
+        if self.on_iteration_end is None:
+            return
+        try:
+            self.on_iteration_end(self, record)
+        except StopTraining:
+            raise
+        except Exception as error:
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            self.log.message(
+                f"on_iteration_end failed in iteration {self.progress.iterations - 1} ({what}); "
+                f"{self._saved_sentence()}"
+            )
+            raise
 
     def _iterate(self, iteration: int) -> dict[str, float]:
         """Drive an iteration's episodes, then learn; return its scalars."""
