@@ -15,7 +15,7 @@ from rcdsac_trl.config.compose import combinations, compose, output_folder
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.system.resources import fault_sentence
-from rcdsac_trl.system.runtime import bound_threads, keep_pages, quiet_libraries
+from rcdsac_trl.system.runtime import bound_threads, keep_pages, let_workers_rest, quiet_libraries
 
 Task = Callable[[DictConfig], None]
 
@@ -90,6 +90,7 @@ def _program(started: Callable[[], None]) -> None:
         bound_threads()
         keep_pages()
         quiet_libraries()
+        let_workers_rest()
         started()
     except KeyboardInterrupt:
         print("rcdsac_trl: interrupted", file=sys.stderr)

@@ -134,13 +134,17 @@ def refusal(
         ([POW, "logger.backends=csv"], "logger.backends=csv must be a list of words in brackets"),
         # what does not go together
         (
-            [POW, "collector=single", "world.num_agents=10", "world.num_workers=3"],
+            [POW, "collector=parallel_env", "world.num_agents=10", "world.num_workers=3"],
             "num_workers=3 cannot share 10 agents evenly",
         ),
         ([POW, "world.num_workers=2"], "world.num_workers=2 does nothing with collector=multi: give collector.num_pro"),
         (
             [POW, "collector=single", "+collector.num_processes=2"],
             "collector.num_processes=2 does nothing with collector=single: give world.num_workers",
+        ),
+        (
+            [POW, "collector=parallel_env", "world.num_workers=0"],
+            "world.num_workers=0 leaves collector=parallel_env without workers: give 1 or more, or auto",
         ),
         (
             [POW, "+collector.address=auto"],
@@ -155,16 +159,8 @@ def refusal(
             "collector.num_processes=3 cannot share world.num_agents=10 evenly: give a divisor",
         ),
         (
-            [POW, "+collector.slurm={partition: long, timeout_min: 9}"],
-            "collector.slurm does nothing with collector=multi: take collector=distributed",
-        ),
-        (
-            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 9}"],
-            "collector.num_processes=auto counts the cores of this machine, not SLURM's",
-        ),
-        (
-            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 0}"],
-            "collector.slurm.timeout_min=0 must be at least 1",
+            [POW, "collector=distributed"],
+            "collector=distributed does not exist: choose one of multi, parallel_env, ray",
         ),
         ([POW, "collector.num_processes=-1"], "collector.num_processes=-1 is not a number of processes"),
         ([POW, "world.num_agents=0"], "world.num_agents=0 is below 1"),
@@ -401,7 +397,7 @@ def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -
 @pytest.mark.parametrize(
     "processes",
     [
-        ["collector=single", "world.num_workers=2"],
+        ["collector=parallel_env", "world.num_workers=2"],
         ["collector.num_processes=2"],
         ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"],
         ["collector=ray", "collector.num_processes=2"],

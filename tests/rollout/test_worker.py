@@ -99,7 +99,7 @@ COLLECTORS = {
     "one process": ("collector.num_processes=0",),
     "two": ("collector.num_processes=2",),
     "single": ("collector=single",),
-    "single of workers": ("collector=single", "world.num_workers=3"),
+    "parallel": ("collector=parallel_env", "world.num_workers=3"),
 }
 AGENTS = 3
 
@@ -127,7 +127,7 @@ def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pyt
     monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
     first = collected(row, *COLLECTORS["one process"])
     assert first[0].batch_size == (AGENTS, STEPS)
-    for name in ("two", "single", "single of workers"):
+    for name in ("two", "single", "parallel"):
         for batch, expected in zip(collected(row, *COLLECTORS[name]), first, strict=True):
             for key in expected.keys(True, True):
                 assert torch.equal(batch[key], expected[key]), (name, key)

@@ -18,24 +18,23 @@ import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import ParallelEnv
 
 from rcdsac_trl import train
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.run_config import CHECKPOINTS
 from rcdsac_trl.errors import TrainingError, UserInputError
 from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.rollout.policies import CollectionPolicy
 from rcdsac_trl.rollout.worker_processes import Request, TeamProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress, newest
 from rcdsac_trl.system import resources
-from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.training.setup import resume_training
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.task.agent_group import AgentGroup
-from rcdsac_trl.world.task.env import make_env
-from rcdsac_trl.world.task.parallel import Workers
 from tiny import STEPS, TINY, tiny_trainer
 
-WORKERS = ["collector=single", "world.num_workers=2", "schedule.iterations=3", "validation.every_iterations=3"]
+WORKERS = ["collector=parallel_env", "world.num_workers=2", "schedule.iterations=3", "validation.every_iterations=3"]
 SMALL = MapSettings(size_m=10.0, layouts=("clutter",), num_movers=0)
 
 
@@ -45,17 +44,17 @@ def signalled(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Send the second worker of a split a signal before some of its steps, counted over all environments."""
 
     def arrange(split: str, at: list[int], number: signal.Signals = signal.SIGKILL) -> None:
-        step = Workers._step
+        step = ParallelEnv._step
         counted = [0]
 
-        def counting(self: Workers, tensordict: TensorDictBase) -> TensorDictBase:
+        def counting(self: ParallelEnv, tensordict: TensorDictBase) -> TensorDictBase:
             if self.create_env_kwargs[0]["split"] == split:
                 if counted[0] in at:
                     os.kill(self._workers[1].pid, number)
                 counted[0] += 1
             return step(self, tensordict)
 
-        monkeypatch.setattr(Workers, "_step", counting)
+        monkeypatch.setattr(ParallelEnv, "_step", counting)
 
     return arrange
 
@@ -146,7 +145,8 @@ def test_a_worker_that_hangs_counts_as_dead_and_too_many_faults_end_the_run(
     # Making a map takes a moment too, and other work may take the core meanwhile.
     trainer = tiny_trainer(run, "rcdsac_pow", *WORKERS, "world.worker_timeout_s=6", "world.max_restarts=1")
     told = (
-        "iteration 1, training map 2: worker process 2 of 2 (split train, seed 0, agents 1) gave no answer within 6 s; "
+        "iteration 1, training map 2: one of 2 worker processes (split train, seed 0, agents 0; split train, seed 0, "
+        "agents 1) gave no answer within 6 s; "
         f"world.max_restarts=1 allows no further restart: training stops; 1 iterations are saved, resume={run} "
         "continues there"
     )
@@ -161,30 +161,17 @@ def test_a_worker_that_hangs_counts_as_dead_and_too_many_faults_end_the_run(
     assert training_rows(run)["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
 
 
-@pytest.mark.parametrize("act", ["step", *(pytest.param(act, marks=pytest.mark.slow) for act in ("reset", "seed"))])
-def test_a_dead_worker_is_named_whatever_it_is_asked(act: str) -> None:
-    env = make_env(SMALL, seed=3, agent_ids=range(4), num_workers=2)
-    tensordict = env.reset()
-    pids = [worker.pid for worker in env._workers]
-    os.kill(pids[0], signal.SIGKILL)
-    env._workers[0].join()
-    told = r"worker process 1 of 2 \(split train, seed 3, agents 0, 1\) was killed by SIGKILL"
-    ask = {"step": lambda: env.rand_step(tensordict), "seed": lambda: env.set_seed(0), "reset": env.reset}[act]
-    with pytest.raises(WorkerError, match=told):
-        ask()
-    env.close()
-    for pid in pids:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, 0)
-
-
-def test_a_worker_that_fails_by_itself_is_named_with_its_exit_code() -> None:
-    env = make_env(SMALL, agent_ids=range(2), num_workers=2)
-    tensordict = env.reset()
-    tensordict["action"] = env.action_spec.rand() + 5.0
-    with pytest.raises(WorkerError, match=r"worker process [12] of 2 .* ended with exit code 1"):
-        env.step(tensordict)
-    env.close()
+def test_a_worker_that_fails_by_itself_is_named_with_its_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        CollectionPolicy, "forward", lambda self, td: td.set("action", torch.full((*td.batch_size, 2), 5.0))
+    )
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", *WORKERS, "world.max_restarts=0")
+    told = r"worker process [12] of 2 \(split train, seed 0, agents [01]\) ended with exit code 1"
+    with pytest.raises(TrainingError, match=told):
+        trainer.run()
+    assert not multiprocessing.active_children()
 
 
 # ------------------------------------------------------------------------------------------------ the disk

@@ -18,6 +18,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.errors import TrainingError
+from rcdsac_trl.rollout.env_workers import EnvWorkers
 from rcdsac_trl.rollout.episode_collectors import CollectorEpisodes
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.metrics import METRICS
@@ -214,6 +215,7 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
             lambda iteration: events.append(("iteration", iteration)),
             iteration=parts["progress"].iterations,
             map_index=parts["progress"].iterations + parts["progress"].skipped_maps,
+            workers=EnvWorkers([], None),
         ),
         learner=StubLearner(events, parts["interrupt_in"], parts["progress"].iterations),
         guard=StubGuard(events, parts["fail_in"]),  # type: ignore[arg-type]
@@ -388,9 +390,7 @@ def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
     events.clear()
     with pytest.raises(ZeroDivisionError):
         stub_trainer(tmp_path, events, checkpoint_every=1, on_iteration_end=fail).run()
-    sentence = (
-        f"on_iteration_end failed in iteration 0 (ZeroDivisionError:); 0 iterations are saved, resume={tmp_path}"
-    )
+    sentence = f"on_iteration_end failed in iteration 0 (ZeroDivisionError:); 0 iterations are saved, resume={tmp_path}"
     assert sentence in (tmp_path / "train.log").read_text()
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
 
@@ -670,7 +670,7 @@ def test_workers_do_not_change_a_run(
 ) -> None:
     """Workers in this process: the same code with the same shapes, without the time that processes take."""
     monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
-    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "collector=single", f"world.num_workers={workers}")
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "collector=parallel_env", f"world.num_workers={workers}")
     assert isinstance(trainer.episodes, CollectorEpisodes)
     assert trainer.episodes._collector is not None
     assert trainer.episodes._collector.env.batch_size == torch.Size([workers, AGENTS // workers])
@@ -679,7 +679,7 @@ def test_workers_do_not_change_a_run(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [["collector=single", "world.num_workers=2"], ["collector.num_processes=2"]])
+@pytest.mark.parametrize("given", [["collector=parallel_env", "world.num_workers=2"], ["collector.num_processes=2"]])
 def test_worker_processes_do_not_change_a_run(tiny_run: Path, tmp_path: Path, given: list[str]) -> None:
     tiny_trainer(tmp_path / "run", "rcdsac_pow", *given).run()
     assert_equal_runs(tiny_run, tmp_path / "run")

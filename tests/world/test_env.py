@@ -295,6 +295,5 @@ def test_workers_leave_the_number_of_threads_alone() -> None:
         env.reset()
         assert torch.get_num_threads() == threads
         env.close()
-        assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)

@@ -115,11 +115,7 @@ class TrainingSettings:
         check_least("seed", self.seed, 0)
         runtime.resolve_threads(self.threads)
         self.collector.check_agents(self.world.num_agents)
-        if self.collector.name != "single" and self.world.num_workers != 0:
-            raise UserInputError(
-                f"world.num_workers={self.world.num_workers} does nothing with collector={self.collector.name}: give "
-                "collector.num_processes, or take collector=single"
-            )
+        self.collector.check_workers(self.world.num_workers)
         if self.schedule.distortion_strength(0) < 1:
             self.algo.distortion.measure.temper(0.0, 0.0)  # refuses a measure without a neutral beta
         if not self.algo.default_conditions:

@@ -61,6 +61,15 @@ def quiet_libraries() -> None:
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
 
+def let_workers_rest() -> None:
+    """Let the workers of a ``ParallelEnv`` wait for days, unless a user says otherwise.
+
+    They would give up after three hours without work, which a learner may well take. TorchRL reads this as it is
+    imported; they end with the process that started them all the same.
+    """
+    os.environ.setdefault("BATCHED_PIPE_TIMEOUT", "1000000")
+
+
 def allocator() -> str:
     """Name the allocator's state for the log."""
     if "LD_PRELOAD" in os.environ:
