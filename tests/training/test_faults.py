@@ -88,13 +88,13 @@ def test_a_run_goes_on_after_a_worker_was_killed(tmp_path: Path, signalled: Call
 
 
 def test_a_run_goes_on_after_a_team_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rcdsac_trl.rollout.worker_processes.START_METHOD", "fork")  # starts at once
+    monkeypatch.setattr("rcdsac_trl.system.process_pool.START_METHOD", "fork")  # starts at once
     ask, asked = TeamProcesses.ask, [0]
 
     def killing(self: TeamProcesses, request: Request) -> TensorDictBase:
         asked[0] += 1
         if asked[0] == 2:
-            os.kill(self._processes[1].pid, signal.SIGKILL)
+            os.kill(self.pool.processes[1].pid, signal.SIGKILL)
         return ask(self, request)
 
     monkeypatch.setattr(TeamProcesses, "ask", killing)
@@ -111,7 +111,7 @@ def test_a_run_goes_on_after_a_team_was_killed(tmp_path: Path, monkeypatch: pyte
 def test_a_validation_after_a_fault_is_what_it_would_have_been(
     tmp_path: Path, tiny_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rcdsac_trl.rollout.evaluation_pool.START_METHOD", "fork")  # starts at once
+    monkeypatch.setattr("rcdsac_trl.system.process_pool.START_METHOD", "fork")  # starts at once
     step = AgentGroup.step
     left = iter(tmp_path / f"killed{number}" for number in range(2))
     main = os.getpid()
