@@ -12,7 +12,7 @@ from rcdsac_trl.config.compose import combinations, compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.training.setup import check_training, make_trainer
 from rcdsac_trl.training.trainer import Trainer
 
@@ -101,6 +101,6 @@ def _composed_once(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
 
 def first_combinations_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the first combination of each run of a sweep stand for the others, composed once for all sweeps."""
-    module = import_module("rcdsac_trl.experiments.make_sweep")
+    module = import_module("rcdsac_trl.experiments.sweep_jobs")
     monkeypatch.setattr(module, "combinations", lambda overrides: combinations(overrides)[:1])
     monkeypatch.setattr(module, "compose", lambda name, overrides: _composed_once(name, tuple(overrides)))

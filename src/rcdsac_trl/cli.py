@@ -1,11 +1,13 @@
 """Hydra entry points whose mistakes end in one sentence and exit code 2, before anything is written."""
 
+import importlib
 import sys
 from argparse import Namespace
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -23,14 +25,73 @@ Task = Callable[[DictConfig], None]
 INTERRUPTED = 130
 
 
+@dataclass(frozen=True)
+class Command:
+    """A verb that makes one object of its config and runs it; called, it is the program.
+
+    Functions may be named, ``"<module>:<function>"``, so that they are imported only when they are called: ``--help``
+    and most mistakes need no torch.
+
+    Attributes:
+        name: of the verb, and of its root config in ``conf/``.
+        make: takes the composed config, refuses what cannot work, writes nothing, and returns what has a ``run()`` that
+            works, writes and prints.
+        describe: puts a folder of results into words; ``run`` is given it.
+    """
+
+    name: str
+    make: str | Callable[[DictConfig], Any]
+    describe: str | None = None
+
+    def check(self, cfg: DictConfig) -> None:
+        """Refuse what cannot work, before anything is written."""
+        _function(self.make)(cfg)
+
+    def __call__(self) -> None:
+        """Do what ``python -m rcdsac_trl.<name>`` does."""
+
+        def task(cfg: DictConfig) -> None:
+            described_by = () if self.describe is None else (_function(self.describe),)
+            _function(self.make)(cfg).run(*described_by)
+
+        task.__module__ = f"rcdsac_trl.{self.name}"  # by which Hydra names the program
+        entry_point(self.name, check=self.check)(task)()
+
+
+@dataclass(frozen=True)
+class OverridesCommand:
+    """A verb whose overrides are meant for more than one config, so that what it makes composes for itself.
+
+    Attributes:
+        name: of the verb, and of the root config that ``--help`` and the like show.
+        make: as that of :class:`Command`, but takes the overrides.
+    """
+
+    name: str
+    make: str
+
+    def __call__(self) -> None:
+        """Do what ``python -m rcdsac_trl.<name>`` does."""
+        _program(self._start)
+
+    def _start(self) -> None:
+        arguments = read_arguments(sys.argv[1:])
+        if arguments is None:
+            _hydra_main(self.name, lambda cfg: None)
+        elif arguments.multirun:
+            raise UserInputError("-m is for `train`: leave it out")
+        else:
+            _function(self.make)(arguments.overrides).run()
+
+
 def entry_point(
     config_name: str,
     *,
-    check: Task,
-    check_folder: Callable[[Path], None] | None = None,
+    check: str | Task,
+    check_folder: str | None = None,
     instead: Callable[[list[str], bool], bool] | None = None,
 ) -> Callable[[Task], Callable[[], None]]:
-    """Make a Hydra main of a task.
+    """Make a Hydra main of a task. Functions may be named, as those of a :class:`Command`.
 
     Args:
         config_name: the root config in ``conf/``.
@@ -45,51 +106,42 @@ def entry_point(
         @wraps(task)
         def guarded(cfg: DictConfig) -> None:
             try:
-                check(cfg)
                 task(cfg)
             except Exception as error:
                 _fail_or_raise(error)
 
-        def started() -> None:
-            asked = read_arguments(sys.argv[1:])
-            if instead is not None and asked is not None and instead(asked.overrides, asked.multirun):
+        def start() -> None:
+            arguments = read_arguments(sys.argv[1:])
+            if instead is not None and arguments is not None and instead(arguments.overrides, arguments.multirun):
                 return
-            precheck(config_name, sys.argv[1:], check, check_folder)
-            hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
+            folder_checked_by = None if check_folder is None else _function(check_folder)
+            precheck(config_name, sys.argv[1:], _function(check), folder_checked_by)
+            _hydra_main(config_name, guarded)
 
-        return partial(_program, started)
-
-    return decorate
-
-
-def overrides_entry_point(config_name: str) -> Callable[[Callable[[list[str]], None]], Callable[[], None]]:
-    """Make a main of a task that composes for itself, since its overrides are meant for more than one config.
-
-    Args:
-        config_name: the root config that ``--help`` and the like show.
-    """
-
-    def decorate(task: Callable[[list[str]], None]) -> Callable[[], None]:
-        def started() -> None:
-            asked = read_arguments(sys.argv[1:])
-            if asked is None:
-                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(lambda cfg: None)()
-            elif asked.multirun:
-                raise UserInputError("-m is for `train`: leave it out")
-            else:
-                task(asked.overrides)
-
-        return partial(_program, started)
+        return partial(_program, start)
 
     return decorate
 
 
-def _program(started: Callable[[], None]) -> None:
+def _hydra_main(config_name: str, task: Task) -> None:
+    hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(task)()
+
+
+def _function(named: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Import the function that is named ``"<module>:<function>"``."""
+    if not isinstance(named, str):
+        return named
+    module, _, name = named.partition(":")
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function
+
+
+def _program(start: Callable[[], None]) -> None:
     """Do what a program does, so that a mistake, a fault and Ctrl-C each end it as its users expect."""
     keep_pages()
     quiet_libraries()
     try:
-        started()
+        start()
     except KeyboardInterrupt:
         print("rcdsac_trl: interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
@@ -106,8 +158,8 @@ def fail(error: UserInputError | FaultError) -> NoReturn:
 def _fail_or_raise(error: Exception) -> NoReturn:
     if isinstance(error, UserInputError | FaultError):
         fail(error)
-    if (told := fault_sentence(error)) is not None:
-        fail(FaultError(told))
+    if (sentence := fault_sentence(error)) is not None:
+        fail(FaultError(sentence))
     raise error
 
 

@@ -15,7 +15,7 @@ from rcdsac_trl import evaluate, train
 from rcdsac_trl.cli import precheck
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.evaluation_run import EvaluationRun
+from rcdsac_trl.evaluation.measured_run import MeasuredRun
 from rcdsac_trl.storage.checkpoint_record import load_progress
 from tiny import ROWS, TINY
 
@@ -38,7 +38,7 @@ def refusal(
         raise AssertionError("it was not refused")
 
     monkeypatch.setattr("rcdsac_trl.training.setup.make_trainer", started)
-    monkeypatch.setattr(EvaluationRun, "run", started)
+    monkeypatch.setattr(MeasuredRun, "run", started)
 
     def call(main: Callable[[], None], arguments: list[str]) -> str:
         monkeypatch.setattr(sys, "argv", ["prog", *arguments])
@@ -259,18 +259,19 @@ RUN = "run=<the tiny run>"
             [RUN, "beta=[-1]", "beta_controller=[clearance]"],
             "beta_controller=[clearance] turns beta between the values of beta: give two or more of them",
         ),
-        ([RUN, "beta=[-2,-1]", "beta_controller=[bandit,bandit]"], "beta_controller=bandit is given more than once"),
         (
-            [RUN, "beta=[-2,-1]", "beta_controller=[mood]"],
-            "beta_controller=['mood'] must be a list of some of clearance, tail_variance, bandit in brackets or null",
+            [RUN, "beta=[-2,-1]", "beta_controller=[clearance,clearance]"],
+            "beta_controller=clearance is given more than once",
+        ),
+        (
+            [RUN, "beta=[-2,-1]", "beta_controller=[bandit]"],
+            "beta_controller=['bandit'] must be a list of some of clearance, tail_variance in brackets or null",
         ),
         (
             [RUN, "beta=[-2,-1]", "controller.near_m=2"],
             "controller.near_m=2 must be above 0 and below controller.far_m=1.2",
         ),
         ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
-        ([RUN, "beta=[-2,-1]", "controller.step_size=0"], "controller.step_size=0 must be above 0"),
-        ([RUN, "beta=[-2,-1]", "controller.exploration=2"], "controller.exploration=2 must be from 0 to 1"),
         (["baseline=random"], "baseline=random must be pursuit or null"),
         (["baseline=pursuit", "beta=[-1]"], "baseline=pursuit has neither beta nor collision weight: leave them out"),
     ],

@@ -11,8 +11,8 @@ import tiny
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.calibration import fractions, predict, roll_out
-from rcdsac_trl.evaluation.make_calibration import make_calibration
+from rcdsac_trl.evaluation.branches import fractions, predict, roll_out
+from rcdsac_trl.evaluation.calibration import make_calibration
 from rcdsac_trl.report import calibration_report as measured
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.make_agent import make_loss

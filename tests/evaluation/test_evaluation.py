@@ -22,10 +22,9 @@ from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation import evaluation_run as evaluation
-from rcdsac_trl.evaluation.evaluation_run import EvaluationRun
-from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout import map_evaluator as driver
+from rcdsac_trl.rollout import measurement
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.rollout.metrics import METRICS
@@ -150,7 +149,7 @@ def test_nothing_is_written_when_it_is_stopped(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(evaluation, "episode_metrics", stop)
+    monkeypatch.setattr(measurement, "episode_metrics", stop)
     with pytest.raises(KeyboardInterrupt):
         evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     assert not (tmp_path / "out").exists()
@@ -226,8 +225,8 @@ class Nothing(TensorDictModuleBase):
 def test_a_table_of_known_episodes(sampled: bool) -> None:
     conditions = [Condition(collision_weight=2.0), Condition(collision_weight=1.0)]
     policy, team = Nothing(), Hits(4)
-    table = evaluation.table_of(
-        evaluation.measure_map(team, policy, conditions=conditions, num_agents=2, map_index=map_index, sampled=sampled)
+    table = measurement.table_of(
+        measurement.measure_map(team, policy, conditions=conditions, num_agents=2, map_index=map_index, sampled=sampled)
         for map_index in (2, 0, 1)
     )
     assert policy.kinds == {ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC}
@@ -279,7 +278,7 @@ def test_the_weighted_row_is_paid_with_its_weight_and_reported_without(tmp_path:
     torch.testing.assert_close(steps["next", "reward"].squeeze(-1).sum(1), paid, rtol=1e-5, atol=1e-4)
     collisions = (parts[..., 4] / -10.0).sum(1)
     assert collisions.sum() > 0, "the map is crowded enough to tell the two rewards apart"
-    reported = evaluation.episode_metrics(steps)["reward"]
+    reported = measurement.episode_metrics(steps)["reward"]
     torch.testing.assert_close(reported.float(), (rest + parts[..., 4]).sum(1), rtol=1e-5, atol=1e-4)
 
 
@@ -407,7 +406,7 @@ def test_a_validation_repeats_itself_and_follows_its_snapshot(tmp_path: Path) ->
 
 def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    built: EvaluationRun = make_evaluation(compose("evaluate", [f"run={run}", "beta=[-1]", f"out={out}"]))
+    built = make_evaluation(compose("evaluate", [f"run={run}", "beta=[-1]", f"out={out}"]))
     assert built.results.path == out
     assert not out.exists()
 

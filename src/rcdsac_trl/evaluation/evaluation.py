@@ -1,4 +1,4 @@
-"""An evaluation from its config."""
+"""Evaluation: the same maps, starts and goals for every agent, deterministic actions, one row an episode."""
 
 import sys
 from collections.abc import Generator
@@ -6,24 +6,22 @@ from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 
-import pandas as pd
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings, Name
-from rcdsac_trl.config.run_config import CHECKPOINTS, evaluation_settings, settings_of_run, training_settings
+from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_of_run, training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.deploy.policy.beta_controllers import BanditBeta
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.evaluation_run import EvaluationRun
 from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
-from rcdsac_trl.rollout.beta_control import BANDIT, play_bandit
+from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.rollout.evaluation_pool import Rows, drive_maps
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, packed, packed_loss
 from rcdsac_trl.rollout.map_evaluator import Agent, Course, driver
-from rcdsac_trl.seeding import stream
+from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS, table_of
+from rcdsac_trl.rollout.metrics import summarise
 from rcdsac_trl.storage.checkpoint import load_weights
 from rcdsac_trl.storage.checkpoint_record import find
 from rcdsac_trl.system import resources, runtime
@@ -33,21 +31,22 @@ from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 
-def make_evaluation(cfg: DictConfig) -> EvaluationRun:
+def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     """Make an evaluation of a run or a baseline; refuses before anything is written.
+
+    It writes ``episodes.csv``, ``summary.csv``, ``evaluation.json`` and, if asked for, films.
 
     Raises:
         UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit.
     """
-    settings = evaluation_settings(cfg)
+    settings = read_config(cfg, EvaluationSettings)
     if settings.record:
         check_extra()
     trained = _trained(settings)
     algo = trained.algo if settings.run is not None else None
     conditions = [Condition()] if algo is None else algo.conditions(settings.beta, settings.collision_weight)
     controllers = settings.beta_controller or ()
-    # The bandit's episodes are among those of the fixed values: none is driven for it.
-    driven = [*conditions, *(Condition(controller=name) for name in controllers if name != BANDIT)]
+    driven = [*conditions, *(Condition(controller=name) for name in controllers)]
     world = _evaluation_world(settings, trained, len(driven))
     device = runtime.resolve_device(settings.device)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
@@ -58,8 +57,8 @@ def make_evaluation(cfg: DictConfig) -> EvaluationRun:
     if settings.run is not None:
         checkpoints = Path(settings.run) / CHECKPOINTS
         find(checkpoints, settings.checkpoint)
-        told = "".join(f"-{name}".replace("=", "_") for name in [*map(str, conditions), *controllers])
-        default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{told}"
+        contexts = "".join(f"-{condition}".replace("=", "_") for condition in driven)
+        default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{contexts}"
     else:
         default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
 
@@ -85,7 +84,7 @@ def make_evaluation(cfg: DictConfig) -> EvaluationRun:
         make = partial(driver, course, *(agent() or (None,)))
         return drive_maps(make, settings.num_maps, processes)
 
-    def film(folder: Path) -> list[Path]:
+    def film(folder: Path, rows: Rows) -> list[Path]:
         name = str(settings.baseline) if algo is None else algo.name
         headings = [f"{name}  {condition.heading}".strip() for condition in driven]
         return write_film(course, agent(), settings.video, headings, folder)
@@ -101,32 +100,34 @@ def make_evaluation(cfg: DictConfig) -> EvaluationRun:
         "num_maps": settings.num_maps,
         "num_episodes": settings.num_episodes,
         "sampled": settings.sampled,
-        "conditions": [*map(str, conditions), *controllers],
+        "conditions": [str(condition) for condition in driven],
         "map": asdict(world.map_settings),
         "task": asdict(world.task),
         "commit": commit(),
     } | ({"controller": asdict(settings.controller)} if controllers else {})
-    return EvaluationRun(
+    return MeasuredRun(
+        kind="evaluation",
         out=Path(settings.out) if settings.out is not None else default_out,
         described=described,
-        num_maps=settings.num_maps,
-        maps=maps,
-        more=partial(_played, settings) if BANDIT in controllers else None,
+        unit="map",
+        num_units=settings.num_maps,
+        measure=maps,
+        findings=_findings,
         film=film if settings.record else None,
     )
 
 
-def _played(settings: EvaluationSettings, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Return the episodes that a bandit would have driven."""
-    chosen, turned = settings.beta, settings.controller
-    assert chosen is not None
-    bandit = BanditBeta(
-        sorted(chosen),
-        stream(settings.seed, "beta bandit"),
-        step_size=turned.step_size,
-        exploration=turned.exploration,
+def _findings(rows: Rows) -> Findings:
+    episodes = table_of([rows])
+    summary = summarise(episodes, [key for key in CONDITION_COLUMNS if key in episodes])
+    shown = summary.dropna(axis="columns", how="all").set_index("episodes")
+    return Findings(
+        {
+            "episodes.csv": episodes.to_csv(index=False, float_format="%.9g"),
+            "summary.csv": summary.to_csv(index=False, float_format="%.6g"),
+        },
+        text=shown.T.to_string(header=True, float_format="{:.3f}".format, na_rep=""),
     )
-    return play_bandit(episodes, bandit)
 
 
 def _read_agent(trained: TrainingSettings, checkpoints: Path, checkpoint: Name) -> Agent:
