@@ -5,7 +5,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -29,8 +29,8 @@ INTERRUPTED = 130
 class Command:
     """A verb that makes one object of its config and runs it; called, it is the program.
 
-    Functions may be named, ``"<module>:<function>"``, so that they are imported only when they are called: ``--help``
-    and most mistakes need no torch.
+    Functions may be named, ``"<module>:<function>"``, and are then imported when they are called: ``--help`` needs no
+    torch.
 
     Attributes:
         name: of the verb, and of its root config in ``conf/``.
@@ -54,7 +54,6 @@ class Command:
             described_by = () if self.describe is None else (_function(self.describe),)
             _function(self.make)(cfg).run(*described_by)
 
-        task.__module__ = f"rcdsac_trl.{self.name}"  # by which Hydra names the program
         entry_point(self.name, check=self.check)(task)()
 
 
@@ -87,11 +86,11 @@ class OverridesCommand:
 def entry_point(
     config_name: str,
     *,
-    check: str | Task,
-    check_folder: str | None = None,
+    check: Task,
+    check_folder: Callable[[Path], None] | None = None,
     instead: Callable[[list[str], bool], bool] | None = None,
 ) -> Callable[[Task], Callable[[], None]]:
-    """Make a Hydra main of a task. Functions may be named, as those of a :class:`Command`.
+    """Make a Hydra main of a task.
 
     Args:
         config_name: the root config in ``conf/``.
@@ -103,20 +102,12 @@ def entry_point(
     """
 
     def decorate(task: Task) -> Callable[[], None]:
-        @wraps(task)
-        def guarded(cfg: DictConfig) -> None:
-            try:
-                task(cfg)
-            except Exception as error:
-                _fail_or_raise(error)
-
         def start() -> None:
             arguments = read_arguments(sys.argv[1:])
             if instead is not None and arguments is not None and instead(arguments.overrides, arguments.multirun):
                 return
-            folder_checked_by = None if check_folder is None else _function(check_folder)
-            precheck(config_name, sys.argv[1:], _function(check), folder_checked_by)
-            _hydra_main(config_name, guarded)
+            precheck(config_name, sys.argv[1:], check, check_folder)
+            _hydra_main(config_name, task)
 
         return partial(_program, start)
 
@@ -124,7 +115,27 @@ def entry_point(
 
 
 def _hydra_main(config_name: str, task: Task) -> None:
-    hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(task)()
+    def guarded(cfg: DictConfig) -> None:
+        try:
+            task(cfg)
+        except Exception as error:  # Hydra would print it in its own way
+            _fail_or_raise(error)
+
+    guarded.__module__ = f"rcdsac_trl.{config_name}"  # by which Hydra names the program
+    hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
+
+
+def late(name: str) -> Callable[..., Any]:
+    """Return a function that is imported when it is called.
+
+    Args:
+        name: ``"<module>:<function>"``.
+
+    Example:
+        >>> late("math:hypot")(3.0, 4.0)
+        5.0
+    """
+    return lambda *given: _function(name)(*given)
 
 
 def _function(named: str | Callable[..., Any]) -> Callable[..., Any]:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.cli import entry_point
+from rcdsac_trl.cli import entry_point, late
 
 if TYPE_CHECKING:
     from rcdsac_trl.training.trainer import Trainer
@@ -33,8 +33,8 @@ def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
 
 @entry_point(
     "train",
-    check="rcdsac_trl.training.setup:check_training",
-    check_folder="rcdsac_trl.training.run_log:check_folder",
+    check=late("rcdsac_trl.training.setup:check_training"),
+    check_folder=late("rcdsac_trl.training.run_log:check_folder"),
     instead=sweep_or_continue,
 )
 def main(cfg: DictConfig) -> None:

@@ -6,16 +6,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from omegaconf import DictConfig
 
 import tiny
 from rcdsac_trl import evaluate, train
-from rcdsac_trl.cli import precheck
+from rcdsac_trl.cli import Command, precheck
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.measured_run import MeasuredRun
+from rcdsac_trl.report.card import driving_section
 from rcdsac_trl.storage.checkpoint_record import load_progress
 from tiny import ROWS, TINY
 
@@ -330,6 +333,37 @@ def test_what_only_shows_something_is_left_to_hydra(flag: str) -> None:
         raise AssertionError("checked")
 
     precheck("train", [flag], never)
+
+
+# ------------------------------------------------------------------------------------------------ verbs
+def test_a_command_makes_its_object_of_the_config_and_runs_it_with_what_describes_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")
+    monkeypatch.setattr(sys, "argv", ["calibrate", "num_maps=7"])
+    done: list[object] = []
+
+    class Made:
+        def run(self, *given: object) -> None:
+            done.extend(given)
+
+    def make(cfg: DictConfig) -> Made:
+        done.append(cfg.num_maps)
+        return Made()
+
+    Command("calibrate", make, describe="rcdsac_trl.report.card:driving_section")()
+    assert done == [7, 7, driving_section]  # checked before Hydra begins, and made then
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "course", "evaluate", "export", "publish", "search"])
+def test_what_a_verb_names_exists(verb: str) -> None:
+    command = import_module(f"rcdsac_trl.{verb}").main
+    assert command.name == verb
+    for named in filter(None, (command.make, getattr(command, "describe", None))):
+        module, _, function = named.partition(":")
+        assert callable(getattr(import_module(module), function))
 
 
 # ------------------------------------------------------------------------------------------------ whole processes
