@@ -380,10 +380,10 @@ def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def test_a_refusal_of_the_real_program(tmp_path: Path) -> None:
-    process = start(tmp_path, "rcdsac_trl.train", POW, "learner.batch_size=abc")
+    process = start(tmp_path, "rcdsac_trl.evaluate", "bta=[-1]")  # told before torch is imported
     out, err = process.communicate(timeout=300)
     assert (process.returncode, out) == (2, "")
-    assert err == "rcdsac_trl: learner.batch_size=abc must be a whole number\n"
+    assert err == "rcdsac_trl: there is no key bta: did you mean beta?\n"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -65,9 +65,9 @@ def test_the_same_run_evaluated_twice_gives_identical_files(run: Path, tmp_path:
     assert contents(evaluate(*given, f"out={tmp_path / 'a'}")) == first
 
 
-@pytest.mark.parametrize("sampled", ["false", "true"])
-def test_processes_do_not_change_an_evaluation(run: Path, tmp_path: Path, sampled: str) -> None:
-    given = [f"run={run}", "beta=[-2,-1]", "num_maps=3", f"sampled={sampled}"]
+def test_processes_do_not_change_an_evaluation(run: Path, tmp_path: Path) -> None:
+    """Not even where actions are drawn: then the noise must not depend on who drives either."""
+    given = [f"run={run}", "beta=[-2,-1]", "num_maps=3", "sampled=true"]
     alone = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
     assert contents(evaluate(*given, f"out={tmp_path / 'b'}", "num_workers=2")) == alone
     assert not multiprocessing.active_children()
@@ -87,12 +87,6 @@ def test_another_seed_split_or_agent_gives_other_episodes(run: Path, tmp_path: P
         contents(evaluate(*given, *more, f"out={tmp_path / name}"))["episodes.csv"] for name, more in others.items()
     }
     assert len(found) == len(others)
-
-
-def test_sampled_actions_repeat_too(run: Path, tmp_path: Path) -> None:
-    given = [f"run={run}", "beta=[-1]", "sampled=true"]
-    first = contents(evaluate(*given, f"out={tmp_path / 'a'}"))
-    assert contents(evaluate(*given, f"out={tmp_path / 'b'}")) == first
 
 
 def test_it_never_mixes_with_what_another_wrote_meanwhile(run: Path, tmp_path: Path) -> None:
@@ -164,6 +158,10 @@ def test_rows_and_summary_add_up(run: Path, tmp_path: Path) -> None:
     assert keys == [(beta, map_, i) for beta in (-2.0, -1.0) for map_ in (0, 1) for i in range(3)]
     assert summary["beta"].tolist() == [-2.0, -1.0]
     assert summary["episodes"].tolist() == [6, 6]
+    assert (episodes["collisions"] % 1 == 0).all()
+    assert episodes["contact_fraction"].between(0, 1).all()
+    assert (episodes["contact_fraction"] * 20 >= episodes["collisions"] - 1e-6).all()
+    assert episodes["mean_speed_m_per_s"].between(0, 0.7).all()
     for _, line in summary.iterrows():
         of_beta = episodes[episodes["beta"] == line["beta"]]
         for metric in METRICS:
@@ -172,14 +170,6 @@ def test_rows_and_summary_add_up(run: Path, tmp_path: Path) -> None:
             spread = (sum((value - mean) ** 2 for value in values) / 6) ** 0.5
             assert line[f"{metric}_mean"] == pytest.approx(mean, rel=1e-4, abs=1e-6)
             assert line[f"{metric}_std"] == pytest.approx(spread, rel=1e-3, abs=1e-5)
-
-
-def test_fractions_and_counts_are_possible_numbers(run: Path, tmp_path: Path) -> None:
-    episodes = pd.read_csv(evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}") / "episodes.csv")
-    assert (episodes["collisions"] % 1 == 0).all()
-    assert episodes["contact_fraction"].between(0, 1).all()
-    assert (episodes["contact_fraction"] * 20 >= episodes["collisions"] - 1e-6).all()
-    assert episodes["mean_speed_m_per_s"].between(0, 0.7).all()
 
 
 class Hits:

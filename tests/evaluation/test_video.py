@@ -12,7 +12,6 @@ import pandas as pd
 import pytest
 import torch
 from PIL import Image
-from test_render import SIZE_M, scene
 
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.errors import FaultError, UserInputError
@@ -26,6 +25,7 @@ from rcdsac_trl.evaluation.film.video import Frame, write_video
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
 from rcdsac_trl.world.render import FLOOR, MAPPED, ROBOT, TOUCHING
+from still_scene import SIZE_M, scene
 from tiny import STEPS, evaluate, tiny_settings
 
 

@@ -123,8 +123,8 @@ def test_slurm_is_asked_for_what_was_chosen_and_its_refusal_is_told(
         ("slurm", ["extra.mem_gb=much"], 'launcher.extra is not what submitit takes: Parameter "mem_gb" expected type'),
         (
             "slurm",
-            ["extra.account=lab"],
-            "launcher.extra is not what submitit takes: Parameter 'account' need to be pr",
+            ["extra.queue=lab"],
+            "launcher.extra is not what submitit takes: Parameter 'queue' need to be pr",
         ),
         ("ray", ["gpus_per_run=-1"], "launcher.gpus_per_run=-1 must be at least 0"),
         ("local", ["name=cloud"], "launcher.name=cloud is unknown: choose one of local, joblib, slurm, ray"),
