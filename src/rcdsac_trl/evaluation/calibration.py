@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from omegaconf import DictConfig
@@ -54,8 +55,6 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
     conditions = trained.algo.conditions(settings.beta, None)
     checkpoints = folder / CHECKPOINTS
     find(checkpoints, settings.checkpoint)
-    contexts = "".join(f"-{condition}".replace("=", "_") for condition in conditions)
-    name = f"{settings.checkpoint}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
 
     def maps() -> Generator[Rows, None, None]:
         loss = make_loss(trained, "cpu")
@@ -64,7 +63,27 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         make = partial(_driver, settings, trained, conditions, packed_loss(loss))
         return drive_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
 
-    described = {
+    return MeasuredRun(
+        kind="calibration",
+        out=_default_out(settings, folder, conditions) if settings.out is None else Path(settings.out),
+        described=_described(settings, trained, conditions),
+        unit="map",
+        num_units=settings.num_maps,
+        measure=maps,
+        findings=_findings,
+    )
+
+
+def _default_out(settings: CalibrationSettings, run: Path, conditions: Sequence[Condition]) -> Path:
+    name = f"{settings.checkpoint}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
+    return run / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
+
+
+def _described(
+    settings: CalibrationSettings, trained: TrainingSettings, conditions: Sequence[Condition]
+) -> dict[str, Any]:
+    """Say what is measured and how."""
+    return {
         "agent": trained.algo.name,
         "measure": trained.algo.distortion.name,
         "sensor": trained.sensor.name,
@@ -82,16 +101,6 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         "conditions": [str(condition) for condition in conditions],
         "commit": commit(),
     }
-    default_out = folder / "calibration" / f"{name}{contexts}"
-    return MeasuredRun(
-        kind="calibration",
-        out=default_out if settings.out is None else Path(settings.out),
-        described=described,
-        unit="map",
-        num_units=settings.num_maps,
-        measure=maps,
-        findings=_findings,
-    )
 
 
 @contextlib.contextmanager

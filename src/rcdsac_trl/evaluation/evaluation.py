@@ -5,6 +5,7 @@ from collections.abc import Generator
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -43,78 +44,92 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     if settings.record:
         check_extra()
     trained = _trained(settings)
-    algo = trained.algo if settings.run is not None else None
-    conditions = [Condition()] if algo is None else algo.conditions(settings.beta, settings.collision_weight)
-    controllers = settings.beta_controller or ()
-    driven = [*conditions, *(Condition(controller=name) for name in controllers)]
-    world = _evaluation_world(settings, trained, len(driven))
-    device = runtime.resolve_device(settings.device)
+    course = _course(settings, trained)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
-    simulations = max(1, processes) * world.num_agents
+    simulations = max(1, processes) * course.world.num_agents
     remedy = "lower num_episodes or num_workers, or end other programs"
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
-    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
     if settings.run is not None:
-        checkpoints = Path(settings.run) / CHECKPOINTS
-        find(checkpoints, settings.checkpoint)
-        contexts = "".join(f"-{condition}".replace("=", "_") for condition in driven)
-        default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{contexts}"
-    else:
-        default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
-
-    course = Course(
-        trained=trained,
-        world=world,
-        conditions=driven,
-        split=settings.split,
-        seed=settings.seed,
-        num_episodes=settings.num_episodes,
-        sampled=settings.sampled,
-        device=device,
-        threads=1 if settings.threads == "auto" else settings.threads,
-        trips=True,
-        controller=settings.controller if controllers else None,
-    )
+        find(Path(settings.run) / CHECKPOINTS, settings.checkpoint)
 
     @cache  # Read once: a training that goes on may write another checkpoint meanwhile.
     def agent() -> Agent | None:
-        return None if algo is None else _read_agent(trained, checkpoints, settings.checkpoint)
+        return None if settings.run is None else _read_agent(trained, Path(settings.run), settings.checkpoint)
 
     def maps() -> Generator[Rows, None, None]:
         make = partial(driver, course, *(agent() or (None,)))
         return drive_maps(make, settings.num_maps, processes)
 
     def film(folder: Path, rows: Rows) -> list[Path]:
-        name = str(settings.baseline) if algo is None else algo.name
-        headings = [f"{name}  {condition.heading}".strip() for condition in driven]
+        headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in course.conditions]
         return write_film(course, agent(), settings.video, headings, folder)
 
-    described = {
-        "agent": settings.baseline if algo is None else algo.name,
-        "measure": None if algo is None else algo.distortion.name,
-        "sensor": world.sensor,
-        "train_seed": None if algo is None else trained.seed,
-        "checkpoint": None if algo is None else settings.checkpoint,
-        "split": settings.split,
-        "seed": settings.seed,
-        "num_maps": settings.num_maps,
-        "num_episodes": settings.num_episodes,
-        "sampled": settings.sampled,
-        "conditions": [str(condition) for condition in driven],
-        "map": asdict(world.map_settings),
-        "task": asdict(world.task),
-        "commit": commit(),
-    } | ({"controller": asdict(settings.controller)} if controllers else {})
     return MeasuredRun(
         kind="evaluation",
-        out=Path(settings.out) if settings.out is not None else default_out,
-        described=described,
+        out=Path(settings.out) if settings.out is not None else _default_out(settings, course),
+        described=_described(settings, course),
         unit="map",
         num_units=settings.num_maps,
         measure=maps,
         findings=_findings,
         film=film if settings.record else None,
     )
+
+
+def _course(settings: EvaluationSettings, trained: TrainingSettings) -> Course:
+    conditions = [Condition()]
+    if settings.run is not None:
+        conditions = trained.algo.conditions(settings.beta, settings.collision_weight)
+    controllers = settings.beta_controller or ()
+    conditions += [Condition(controller=name) for name in controllers]
+    return Course(
+        trained=trained,
+        world=_evaluation_world(settings, trained, len(conditions)),
+        conditions=conditions,
+        split=settings.split,
+        seed=settings.seed,
+        num_episodes=settings.num_episodes,
+        sampled=settings.sampled,
+        device=runtime.resolve_device(settings.device),
+        threads=1 if settings.threads == "auto" else settings.threads,
+        trips=True,
+        controller=settings.controller if controllers else None,
+    )
+
+
+def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
+    """Name what drives."""
+    return trained.algo.name if settings.baseline is None else settings.baseline
+
+
+def _default_out(settings: EvaluationSettings, course: Course) -> Path:
+    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
+    if settings.run is None:
+        return Path("evaluation") / f"{settings.baseline}-{course.world.sensor}-{name}"
+    contexts = "".join(f"-{condition}".replace("=", "_") for condition in course.conditions)
+    return Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{contexts}"
+
+
+def _described(settings: EvaluationSettings, course: Course) -> dict[str, Any]:
+    """Say what is measured and how."""
+    trained, is_run = course.trained, settings.run is not None
+    described = {
+        "agent": _name(settings, trained),
+        "measure": trained.algo.distortion.name if is_run else None,
+        "sensor": course.world.sensor,
+        "train_seed": trained.seed if is_run else None,
+        "checkpoint": settings.checkpoint if is_run else None,
+        "split": settings.split,
+        "seed": settings.seed,
+        "num_maps": settings.num_maps,
+        "num_episodes": settings.num_episodes,
+        "sampled": settings.sampled,
+        "conditions": [str(condition) for condition in course.conditions],
+        "map": asdict(course.world.map_settings),
+        "task": asdict(course.world.task),
+        "commit": commit(),
+    }
+    return described | ({} if course.controller is None else {"controller": asdict(course.controller)})
 
 
 def _findings(rows: Rows) -> Findings:
@@ -130,10 +145,10 @@ def _findings(rows: Rows) -> Findings:
     )
 
 
-def _read_agent(trained: TrainingSettings, checkpoints: Path, checkpoint: Name) -> Agent:
+def _read_agent(trained: TrainingSettings, run: Path, checkpoint: Name) -> Agent:
     loss = make_loss(trained, "cpu")
     average = make_average(loss, trained.learner)
-    for damaged in load_weights(checkpoints, checkpoint, loss=loss, average=average):
+    for damaged in load_weights(run / CHECKPOINTS, checkpoint, loss=loss, average=average):
         print(f"rcdsac_trl: {damaged}", file=sys.stderr)
     return Agent(packed(average.module), packed_loss(loss))
 

@@ -79,7 +79,21 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
     def drives() -> Generator[Rows, None, None]:
         return drive_maps(partial(_driver, entries, jobs, conditions, settings.record), len(jobs), processes)
 
-    described = {
+    return MeasuredRun(
+        kind="course",
+        out=_default_out(settings, entries) if settings.out is None else Path(settings.out),
+        described=_described(settings, entries),
+        unit="run",
+        num_units=len(jobs),
+        measure=drives,
+        findings=_findings,
+        film=partial(_films, entries) if settings.record else None,
+    )
+
+
+def _described(settings: CourseSettings, entries: Sequence[Entry]) -> dict[str, Any]:
+    """Say who drives and how."""
+    return {
         "entries": [{"run": entry.run, "agent": entry.agent, "beta": entry.beta} for entry in entries],
         "agents": {entry.run: asdict(entry.pilot.config) for entry in entries if isinstance(entry.pilot, Policy)},
         "course_m": COURSE_M,
@@ -91,16 +105,6 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
         "odometry": asdict(settings.odometry),
         "commit": commit(),
     }
-    return MeasuredRun(
-        kind="course",
-        out=_default_out(settings, entries) if settings.out is None else Path(settings.out),
-        described=described,
-        unit="run",
-        num_units=len(jobs),
-        measure=drives,
-        findings=_findings,
-        film=partial(_films, entries) if settings.record else None,
-    )
 
 
 def _default_out(settings: CourseSettings, entries: Sequence[Entry]) -> Path:
