@@ -14,7 +14,7 @@ from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings
-from rcdsac_trl.config.run_config import evaluation_settings, training_settings
+from rcdsac_trl.config.run_config import read_config, training_settings
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.config.typed import read
@@ -331,7 +331,7 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     settings = tiny_settings("sac", "collector=ray", "collector.num_processes=2", "collector.address=auto")
     make_episodes(settings, make_actor(settings), "cpu", Progress())
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")
-    turned = "beta_controller=[clearance,tail_variance,bandit]"
+    turned = "beta_controller=[clearance,tail_variance]"
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
     evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5")
@@ -346,7 +346,7 @@ def test_every_leaf_of_the_root_is_a_field(root: str) -> None:
     if root == "train":
         settings = training_settings(compose("train", ["+algo=rcdsac_pow", "preset=paper"]))
     else:
-        settings = evaluation_settings(compose("evaluate", ["baseline=pursuit"]))
+        settings = read_config(compose("evaluate", ["baseline=pursuit"]), EvaluationSettings)
     values = {k: v for k, v in yaml_of(f"{root}.yaml").items() if k not in ("defaults", "hydra")}
     found = list(leaves(values))
     assert len(found) > 10

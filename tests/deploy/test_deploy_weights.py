@@ -9,22 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule
 
 import rcdsac_trl
-from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.deploy import Policy, find_weights, read_weights, shipped_names
 from rcdsac_trl.deploy.policy.weights import Weights, packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.run_weights import weights_of_run
-from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.storage import checkpoint_record
-from rcdsac_trl.storage.checkpoint import Checkpoints
-from rcdsac_trl.storage.checkpoint_record import Progress
-from rcdsac_trl.training import run_log
 from robots import AHEAD, OPEN, ROWS, STANDING, agent
-from tiny import tiny_cfg
+from tiny import untrained_run
 
 
 def written(folder: Path, weights: Weights) -> Path:
@@ -126,21 +120,6 @@ print(sorted(heavy & {{name.split(".")[0] for name in sys.modules}}))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
-
-
-def untrained_run(folder: Path, row: str, *overrides: str) -> tuple[Path, LossModule, AveragedModel]:
-    """Write a run folder whose agent has its first weights, the average moved a little so that one can tell."""
-    cfg = tiny_cfg(row, *overrides)
-    trained = training_settings(cfg)
-    loss = make_loss(trained, "cpu")
-    average = make_average(loss, trained.learner)
-    with torch.no_grad():
-        for parameter in average.parameters():
-            parameter += 0.01
-    run_log.start_run_folder(folder, cfg, {})
-    components = {"loss": loss, "average": average}
-    Checkpoints(folder / "checkpoints", components, replay=None, keep=1).save(Progress(updates=7), {})
-    return folder, loss, average
 
 
 @pytest.mark.parametrize("row", ["rcwr", "sac", "dsac_cvar", "rcdsac_cvar"])

@@ -34,7 +34,7 @@ from rcdsac_trl.evaluation.course.course_drive import (
     start_pose,
 )
 from rcdsac_trl.evaluation.course.course_film import frames
-from rcdsac_trl.evaluation.course.make_course import make_course
+from rcdsac_trl.evaluation.course.course_run import make_course
 from rcdsac_trl.evaluation.course.odometry import Odometry
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
 from rcdsac_trl.report.course_table import course_table, paper_course, write_course
@@ -312,7 +312,7 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
 
 
 def test_without_a_shipped_agent_somebody_must_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("rcdsac_trl.evaluation.course.make_course")
+    module = importlib.import_module("rcdsac_trl.evaluation.course.entries")
     monkeypatch.setattr(module, "shipped_names", lambda: [])
     with pytest.raises(UserInputError, match="name who drives"):
         make_course(compose("course", given(tmp_path)))

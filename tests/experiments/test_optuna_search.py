@@ -9,8 +9,8 @@ import pytest
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.experiments import optuna_search as search
-from rcdsac_trl.experiments.make_search import make_search
-from rcdsac_trl.experiments.optuna_search import Choice, Number, Search
+from rcdsac_trl.experiments.optuna_search import Search, make_search
+from rcdsac_trl.experiments.search_space import Choice, Number
 from rcdsac_trl.experiments.sweep import Job, State
 from tiny import SMALL, Calls
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_deploy_weights import untrained_run
 
 import rcdsac_trl
 from rcdsac_trl.config.compose import compose
@@ -19,6 +18,7 @@ from rcdsac_trl.deploy.policy.weights import packed, read_weights
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.release.agent_export import Export, make_export
 from robots import AHEAD, OPEN, ROWS, STANDING, full_size
+from tiny import untrained_run
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")

@@ -24,7 +24,7 @@ from rcdsac_trl import train
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.run_config import CHECKPOINTS
 from rcdsac_trl.errors import TrainingError, UserInputError
-from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout.policies import CollectionPolicy
 from rcdsac_trl.rollout.worker_processes import Request, TeamProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress, newest

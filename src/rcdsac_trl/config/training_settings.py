@@ -1,8 +1,4 @@
-"""All that a training, an evaluation or a calibration may choose, checked as a whole.
-
-The outermost classes are the roots of ``train.yaml``, ``evaluate.yaml``, ``calibrate.yaml``, ``export.yaml`` and
-``search.yaml`` in ``conf/``; :class:`ExperimentSettings` is what a sweep (``sweep.yaml``) makes its runs of.
-"""
+"""All that a training may choose, checked as a whole."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -18,8 +18,8 @@ _ADAPTIVE = (
     "by these very episodes, which favours it a little. p-values are adjusted by Holm's method for the number of "
     "controllers.",
     "clearance: by the nearest thing the sensor sees. tail_variance: by the lower tail of the return that the critics "
-    "expect. bandit: one beta an episode, chosen by the returns of the episodes before, over the maps in their order; "
-    "so its maps are not independent, and its interval and p-value are a rough guide.",
+    "expect. bandit (of earlier versions): one beta an episode, chosen by the returns of the episodes before, over the "
+    "maps in their order; so its maps are not independent, and its interval and p-value are a rough guide.",
 )
 
 

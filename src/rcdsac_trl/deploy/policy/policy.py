@@ -113,9 +113,11 @@ class Policy:
                 part of its memory, `beta` is refused by :meth:`act`, too, or `action` is no action.
 
         Example:
-            >>> policy = Policy(weights)  # doctest: +SKIP
-            >>> policy.act(ranges, waypoints, velocity, beta=0.0)  # doctest: +SKIP
-            >>> policy.foresee(-2.0).wanted  # doctest: +SKIP
+            >>> import rcdsac_trl
+            >>> policy = rcdsac_trl.load("rcdsac_pow-narrow")
+            >>> bold = policy.act(np.full(180, np.inf), [(2.0, 0.0), (3.0, 1.0)], (0.0, 0.0), beta=0.0).wanted
+            >>> policy.foresee(0.0).wanted == bold, policy.foresee(-2.0).wanted == bold
+            (True, False)
         """
         if self._steps == 0:
             raise UserInputError("nothing was seen since the memory was cleared: call act() first")
