@@ -101,6 +101,8 @@ def refusal(
         ([POW, "learner.batch_size=-1"], "learner.batch_size=-1 is not a number of at least 1"),
         ([POW, "learner.actor_lr=inf"], "learner.actor_lr=inf must be a number"),
         ([POW, "learner.actor_lr=0"], "learner.actor_lr=0 is not a positive number"),
+        ([POW, "learner.kappa=0"], "learner.kappa=0 is not a positive number"),
+        ([POW, "learner.burn_in=-1"], "learner.burn_in=-1 is not a number of at least 0"),
         ([POW, "learner.gamma=1"], "learner.gamma=1 is outside [0, 1)"),
         ([POW, "learner.target_coefficient=0"], "learner.target_coefficient=0 is outside (0, 1]"),
         ([POW, "learner.num_critics=3"], "learner.num_critics=3 is neither 1 nor 2"),

@@ -195,7 +195,7 @@ def measure_states(
         )
         critics = predict(loss, branches.history, branch_steps=steps, risk=risk, memory_steps=memory_steps)
         whole = predict(loss, branches.history, branch_steps=steps, risk=risk, memory_steps=max(steps) + 1)
-        over = OVER_CRITICS[loss.target_over_critics]
+        over = OVER_CRITICS[loss.settings.target_over_critics]
         taken, taken_whole = over(list(critics)), over(list(whole))
     return [
         {

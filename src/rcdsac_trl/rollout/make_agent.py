@@ -38,17 +38,8 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
     loss = DistributionalSACLoss(
         actor.to(device),
         [critic.to(device) for critic in critics],
+        learner,
         measure=algo.distortion.measure,
-        num_quantiles=learner.num_quantiles,
-        num_target_quantiles=learner.num_target_quantiles,
-        num_risk_samples=learner.num_risk_samples,
-        fractions_per=learner.fractions_per,
-        fraction_sampling=learner.fraction_sampling,
-        kappa=learner.kappa,
-        alpha_init=learner.alpha_init,
-        target_entropy=learner.target_entropy,
-        burn_in=learner.burn_in,
-        target_over_critics=learner.target_over_critics,
         generator=torch_stream(settings.seed, "loss", device=device),
     ).to(device)
     loss.make_value_estimator(gamma=learner.gamma)
