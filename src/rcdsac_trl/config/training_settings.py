@@ -7,7 +7,7 @@ The outermost classes are the roots of ``train.yaml``, ``evaluate.yaml``, ``cali
 from dataclasses import dataclass
 from typing import Literal
 
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
@@ -101,7 +101,7 @@ class TrainingSettings:
     device: str
     threads: Threads
     world: TeamSettings
-    network: Widths
+    network: NetworkSettings
     learner: LearnerSettings
     replay: ReplaySettings
     schedule: Schedule
