@@ -29,13 +29,17 @@ class Features(nn.Module):
 
     def __init__(self, encoder: Encoder) -> None:
         super().__init__()
+        self.circular = encoder.range.padding == "circular"
         self.conv_1 = copy.deepcopy(encoder.range.conv_1)
         self.conv_2 = copy.deepcopy(encoder.range.conv_2)
         self.linear = copy.deepcopy(encoder.range.linear)
         self.vectors = copy.deepcopy(encoder.vectors)
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
-        positions = F.relu(self.conv_2(F.relu(self.conv_1(range_.flatten(0, 1).unsqueeze(1)))))
+        positions = range_.flatten(0, 1).unsqueeze(1)
+        for convolution, ends in ((self.conv_1, (1, 2)), (self.conv_2, (0, 1))):
+            padded = F.pad(positions, ends, mode="circular") if self.circular else positions
+            positions = F.relu(convolution(padded))
         ranges = F.relu(self.linear(positions.transpose(1, 2).flatten(1))).unflatten(0, range_.shape[:2])
         return torch.cat([ranges, *(F.relu(f(x)) for f, x in zip(self.vectors, vectors, strict=True))], dim=-1)
 

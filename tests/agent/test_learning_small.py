@@ -11,10 +11,10 @@ from torchrl.objectives import SoftUpdate
 
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.loss.loss_settings import LossSettings
-from rcdsac_trl.agent.networks import ActorHead, QuantileHead, Widths
+from rcdsac_trl.agent.networks import ActorHead, NetworkSettings, QuantileHead
 from rcdsac_trl.agent.risk import Neutral, PowerLaw, RiskMeasure
 
-WIDTHS = Widths(memory=2, head=32, cosines=16)
+WIDTHS = NetworkSettings(memory=2, head=32, cosines=16)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 
 

@@ -21,11 +21,11 @@ from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.loss.functional import _quantile_huber_pairwise, quantile_huber_loss, squash
 from rcdsac_trl.agent.loss.loss_settings import LossSettings
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
-SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
+SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 #: Of the losses computed by hand.
 LINEAR = LossSettings(num_quantiles=3, num_target_quantiles=2, num_risk_samples=4, alpha_init=0.2)

@@ -18,16 +18,17 @@ from rcdsac_trl.agent.networks import (
     FEW_OBSERVATIONS,
     ActorHead,
     Encoder,
+    NetworkSettings,
     QuantileHead,
     RangeFeatures,
     ScalarHead,
-    Widths,
 )
 from rcdsac_trl.agent.risk import CVaR, PowerLaw
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
+from rcdsac_trl.robot.ring import Padding
 
-SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
+SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 VECTORS = {**VECTOR_OBSERVATIONS, "collision_weight": 1}
 
 
@@ -54,8 +55,9 @@ NARROW = [*range(21), *range(158, 180)]
 
 @pytest.mark.parametrize("number", [FEW_OBSERVATIONS, BLOCK, 2 * BLOCK + 3])
 @pytest.mark.parametrize("heard", [list(range(180)), NARROW, [90], list(range(9, 180, 10)), []])
-def test_range_features_equal_the_layers(number: int, heard: list[int]) -> None:
-    module = RangeFeatures(6, 16).double()
+@pytest.mark.parametrize("padding", ["circular", "none"])
+def test_range_features_equal_the_layers(number: int, heard: list[int], padding: Padding) -> None:
+    module = RangeFeatures(6, 16, padding).double()
     bins = torch.zeros(number, 180, dtype=torch.float64)
     bins[:, heard] = torch.rand(number, len(heard), dtype=torch.float64)
     fast, plain = module(bins), module.layers(bins)
@@ -157,7 +159,7 @@ def test_range_features_export_as_plain_layers() -> None:
 # ------------------------------------------------------------------------------------------------ encoder
 def test_encoder_shapes() -> None:
     batch = observations(3, 9)
-    encoder = Encoder(VECTORS, Widths())
+    encoder = Encoder(VECTORS, NetworkSettings())
     inputs = [batch["range"], *(batch[key] for key in VECTORS)]
     assert encoder(*inputs).shape == (3, 9, 128)
     state = encoder.step(*(x[:, 0] for x in inputs), torch.ones(3, 1, dtype=torch.bool), torch.zeros(3, 128))
@@ -168,7 +170,7 @@ def test_encoder_shapes() -> None:
 def test_steps_equal_the_sequence(lead: tuple[int, ...]) -> None:
     """Step by step with carried memory is the sequence mode, and `is_init` is a fresh sequence."""
     steps, restart = 7, 4
-    encoder = Encoder(VECTORS, Widths())
+    encoder = Encoder(VECTORS, NetworkSettings())
     batch = observations(max(1, torch.Size(lead).numel()), steps)
     inputs = [batch["range"], *(batch[key] for key in VECTORS)]
     whole = encoder(*inputs)
@@ -195,15 +197,15 @@ def test_only_the_agents_that_begin_are_zeroed() -> None:
 # ------------------------------------------------------------------------------------------------ heads
 def test_head_shapes_and_bounds() -> None:
     memory, action = 100.0 * torch.randn(3, 8, 128), torch.rand(3, 8, 2)
-    loc, scale = ActorHead(2, Widths(), CVaR())(memory, torch.rand(3, 1, 1))
+    loc, scale = ActorHead(2, NetworkSettings(), CVaR())(memory, torch.rand(3, 1, 1))
     assert loc.shape == scale.shape == (3, 8, 2)
     assert scale.min() >= torch.tensor(-20.0).exp()
     assert scale.max() <= torch.tensor(2.0).exp()
     for tau_steps, risk_steps in [(1, 1), (1, 8), (8, 1), (8, 8)]:
-        head = QuantileHead(2, Widths(), CVaR())
+        head = QuantileHead(2, NetworkSettings(), CVaR())
         quantiles = head(memory, action, torch.rand(3, tau_steps, 16), torch.rand(3, risk_steps, 1))
         assert quantiles.shape == (3, 8, 16)
-    assert ScalarHead(2, Widths())(memory, action).shape == (3, 8, 1)
+    assert ScalarHead(2, NetworkSettings())(memory, action).shape == (3, 8, 1)
 
 
 def test_broadcast_conditions_equal_repeated_ones() -> None:
@@ -332,4 +334,4 @@ def test_wrong_choices() -> None:
     with pytest.raises(UserInputError, match="scalar critic cannot be conditioned"):
         build_critic(kind="scalar", measure=CVaR())
     with pytest.raises(UserInputError, match="network width head = 0"):
-        Widths(head=0)
+        NetworkSettings(head=0)

@@ -13,11 +13,11 @@ from torchrl.objectives import SoftUpdate
 from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.loss.loss_settings import LossSettings
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.agent.risk import PowerLaw
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
-SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
+SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 
 

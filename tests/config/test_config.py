@@ -14,7 +14,7 @@ from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings
-from rcdsac_trl.config.run_config import read_config, training_settings
+from rcdsac_trl.config.run_config import agent_of_run, read_config, settings_of_run, training_settings
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.config.typed import read
@@ -455,3 +455,13 @@ def test_replay_holds_an_iteration_and_is_no_larger_than_the_run_can_fill() -> N
     assert tiny_settings("sac", "replay.capacity_steps=40").replay_steps == 40
     with pytest.raises(UserInputError, match=r"capacity_steps=39 does not hold the 40 steps of one iteration"):
         composed("+algo=sac", *TINY, "replay.capacity_steps=39")
+
+
+def test_runs_that_do_not_say_how_they_pad_do_not(tmp_path: Path) -> None:
+    cfg = compose("train", ["+algo=rcdsac_pow"])
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    assert agent_of_run(tmp_path).network.padding == settings_of_run(tmp_path).network.padding == "circular"
+    OmegaConf.set_struct(cfg, False)
+    del cfg.network["padding"]
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    assert agent_of_run(tmp_path).network.padding == settings_of_run(tmp_path).network.padding == "none"

@@ -4,26 +4,13 @@ The action, ``beta`` and :math:`\tau` enter *after* the recurrent layer (paper, 
 encoder pass over the observations of a sequence serves current and next step, data and policy action, every
 ``beta`` and every :math:`\tau`. :mod:`rcdsac_trl.agent.actor` wires the parts to tensor keys.
 
-Public names::
-
-    Widths(conv, range, vector, memory, head, cosines)                              frozen dataclass, all defaults
-    Encoder(vectors: Mapping[str, int], widths)
-        .forward(range [B,T,180], *vectors [B,T,k]) -> memory [B,T,128]             sequence, zero initial state
-        .step(range [*,180], *vectors [*,k], is_init [*,1], state [*,128]) -> state [*,128]   (= memory)
-    ActorHead(action_size, widths, measure | None)
-        .forward(memory [..,128], risk [..,1] | None) -> loc [..,A], scale [..,A]
-    QuantileHead(action_size, widths, measure | None)
-        .forward(memory [B,L,128], action [B,L,A], tau [B,L|1,N], risk [B,L|1,1] | None) -> quantiles [B,L,N]
-    ScalarHead(action_size, widths)
-        .forward(memory [..,128], action [..,A]) -> value [..,1]
-
 Pass ``risk`` and ``tau`` with a time dimension of 1 where they are constant along a sequence: the gate is then computed
 once for it.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -34,9 +21,10 @@ from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
 from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
+from rcdsac_trl.system.checks import one_of
 
-#: Number of range bins of an observation.
-RANGE_SIZE = 180
 #: Bounds of the policy's log standard deviation.
 LOG_STD_RANGE = (-20.0, 2.0)
 #: Below this number, one call of a layer costs more than what it computes.
@@ -49,8 +37,8 @@ def _runs_kernels(x: Tensor) -> bool:
 
 
 @dataclass(frozen=True)
-class Widths:
-    """Layer widths; the defaults are the paper's as far as it states them.
+class NetworkSettings:
+    """Layers of encoders and heads; the defaults are the paper's as far as it states them.
 
     Args:
         conv: channels of both convolutions.
@@ -59,9 +47,10 @@ class Widths:
         memory: size of the recurrent state.
         head: size of every fully-connected layer after the recurrent one, and of the risk gates.
         cosines: number of cosine features of ``beta`` and of a quantile fraction.
+        padding: how the convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
 
     Raises:
-        UserInputError: if a width is below 1.
+        UserInputError: if a width is below 1, or there is no such padding.
     """
 
     conv: int = 32
@@ -70,34 +59,50 @@ class Widths:
     memory: int = 128
     head: int = 128
     cosines: int = 64
+    padding: Padding = "circular"
 
     def __post_init__(self) -> None:
-        """Refuse widths below 1."""
-        for field in fields(self):
-            if getattr(self, field.name) < 1:
-                raise UserInputError(
-                    f"network width {field.name} = {getattr(self, field.name)} is below 1: give a positive integer"
-                )
+        """Refuse widths below 1 and other paddings."""
+        for name, width in self.widths.items():
+            if width < 1:
+                raise UserInputError(f"network width {name} = {width} is below 1: give a positive integer")
+        one_of("network.padding", self.padding, Padding)
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """The sizes of the layers, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, int)}
 
 
 class RangeFeatures(nn.Module):
-    """Two strided convolutions and a linear layer over the range bins: ``[n, 180] -> [n, features]``.
+    """Two strided convolutions and a linear layer over the ring of bins: ``[n, 180] -> [n, features]``.
 
     The linear layer reads the last convolution position by position (all channels of a position together).
+
+    Args:
+        channels: of both convolutions.
+        features: of the linear layer.
+        padding: how the ring is closed; see :mod:`rcdsac_trl.robot.ring`.
     """
 
-    def __init__(self, channels: int, features: int) -> None:
-        """Build the layers for :data:`RANGE_SIZE` bins."""
+    def __init__(self, channels: int, features: int, padding: Padding = "circular") -> None:
+        """Build the layers for :data:`NUM_BINS` bins."""
         super().__init__()
-        self.conv_1 = nn.Conv1d(1, channels, kernel_size=5, stride=2)  # 88 positions
-        self.conv_2 = nn.Conv1d(channels, channels, kernel_size=3, stride=2)  # 43 positions
-        self.linear = nn.Linear(43 * channels, features)
+        self.padding = padding
+        self.conv_1 = nn.Conv1d(1, channels, KERNELS[0], stride=2)
+        self.conv_2 = nn.Conv1d(channels, channels, KERNELS[1], stride=2)
+        self.linear = nn.Linear(num_positions(padding) * channels, features)
+
+    def padded(self, bins: Tensor) -> Tensor:
+        """Return the bins ``[n, 180]`` with those of the ring's other end on both sides, for both convolutions."""
+        before, behind = RING_ENDS[self.padding]
+        return torch.cat((bins[:, NUM_BINS - before :], bins, bins[:, :behind]), dim=1) if before else bins
 
     def forward(self, bins: Tensor) -> Tensor:
         """Map ``[n, 180]`` to ``[n, features]``; no gradient flows to the bins."""
         if not _runs_kernels(bins) or len(bins) < FEW_OBSERVATIONS:
             return self.layers(bins)
-        return observation_features(bins, [], self.stack, [])
+        return observation_features(self.padded(bins), [], self.stack, [])
 
     @property
     def stack(self) -> tuple[nn.Conv1d, nn.Conv1d, nn.Linear]:
@@ -106,7 +111,7 @@ class RangeFeatures(nn.Module):
 
     def layers(self, bins: Tensor) -> Tensor:
         """Compute the same with the layers one by one."""
-        positions = F.relu(self.conv_2(F.relu(self.conv_1(bins.unsqueeze(1)))))
+        positions = F.relu(self.conv_2(F.relu(self.conv_1(self.padded(bins).unsqueeze(1)))))
         return F.relu(self.linear(positions.transpose(1, 2).flatten(1)))
 
 
@@ -116,21 +121,21 @@ class Encoder(nn.Module):
     Args:
         vectors: name and size of every vector observation besides ``range``, in the order of the call, such as
             ``{"waypoint": 6, "velocity": 4}``; each gets its own linear layer.
-        widths: layer widths.
+        network: sizes of the layers.
 
     Example:
-        >>> encoder = Encoder({"waypoint": 6, "velocity": 4}, Widths())
+        >>> encoder = Encoder({"waypoint": 6, "velocity": 4}, NetworkSettings())
         >>> encoder(torch.zeros(2, 8, 180), torch.zeros(2, 8, 6), torch.zeros(2, 8, 4)).shape
         torch.Size([2, 8, 128])
     """
 
-    def __init__(self, vectors: Mapping[str, int], widths: Widths) -> None:
+    def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
         """Build the layers."""
         super().__init__()
-        self.memory_size = widths.memory
-        self.range = RangeFeatures(widths.conv, widths.range)
-        self.vectors = nn.ModuleList(nn.Linear(size, widths.vector) for size in vectors.values())
-        self.gru = nn.GRU(widths.range + widths.vector * len(vectors), widths.memory, batch_first=True)
+        self.memory_size = network.memory
+        self.range = RangeFeatures(network.conv, network.range, network.padding)
+        self.vectors = nn.ModuleList(nn.Linear(size, network.vector) for size in vectors.values())
+        self.gru = nn.GRU(network.range + network.vector * len(vectors), network.memory, batch_first=True)
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
         """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
@@ -139,7 +144,7 @@ class Encoder(nn.Module):
         sequences, steps = range_.shape[:2]
         # Step after step, as the recurrence reads them.
         bins, *others = (value.transpose(0, 1).reshape(sequences * steps, -1) for value in (range_, *vectors))
-        features = observation_features(bins, others, self.range.stack, list(self.vectors))
+        features = observation_features(self.range.padded(bins), others, self.range.stack, list(self.vectors))
         return gated_recurrence(features.view(steps, sequences, -1), self.gru).transpose(0, 1)
 
     def step(self, range_: Tensor, *rest: Tensor) -> Tensor:
@@ -161,7 +166,7 @@ class Encoder(nn.Module):
 
     def _features(self, range_: Tensor, vectors: tuple[Tensor, ...]) -> Tensor:
         lead = range_.shape[:-1]
-        parts = [self.range(range_.reshape(-1, RANGE_SIZE)).reshape(*lead, -1)]
+        parts = [self.range(range_.reshape(-1, NUM_BINS)).reshape(*lead, -1)]
         parts += [F.relu(layer(value)) for layer, value in zip(self.vectors, vectors, strict=True)]
         return torch.cat(parts, dim=-1)
 
@@ -189,20 +194,20 @@ class ActorHead(nn.Module):
 
     Args:
         action_size: number of action dimensions.
-        widths: layer widths.
+        network: sizes of the layers.
         measure: embeds ``beta``; None for no risk gate.
     """
 
-    def __init__(self, action_size: int, widths: Widths, measure: RiskMeasure | None = None) -> None:
+    def __init__(self, action_size: int, network: NetworkSettings, measure: RiskMeasure | None = None) -> None:
         """Build the layers."""
         super().__init__()
         self.measure = measure
-        self.input = nn.Linear(widths.memory, widths.head)
+        self.input = nn.Linear(network.memory, network.head)
         if measure is not None:
-            self.cosines = CosineFeatures(widths.cosines)
-            self.gate = nn.Linear(widths.cosines, widths.head)
-        self.hidden = nn.Linear(widths.head, widths.head)
-        self.output = nn.Linear(widths.head, 2 * action_size)
+            self.cosines = CosineFeatures(network.cosines)
+            self.gate = nn.Linear(network.cosines, network.head)
+        self.hidden = nn.Linear(network.head, network.head)
+        self.output = nn.Linear(network.head, 2 * action_size)
 
     def forward(self, memory: Tensor, risk: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return ``loc`` and ``scale`` ``[.., action]`` of the normal distribution before tanh."""
@@ -224,25 +229,25 @@ class QuantileHead(nn.Module):
 
     Args:
         action_size: number of action dimensions.
-        widths: layer widths.
+        network: sizes of the layers.
         measure: embeds ``beta``; None for a gate of ``tau`` alone.
     """
 
-    def __init__(self, action_size: int, widths: Widths, measure: RiskMeasure | None = None) -> None:
+    def __init__(self, action_size: int, network: NetworkSettings, measure: RiskMeasure | None = None) -> None:
         """Build the layers."""
         super().__init__()
         self.measure = measure
-        self.input = nn.Linear(widths.memory + action_size, widths.head)
-        self.cosines = CosineFeatures(widths.cosines)
-        self.gate_tau = nn.Linear(widths.cosines, widths.head)
+        self.input = nn.Linear(network.memory + action_size, network.head)
+        self.cosines = CosineFeatures(network.cosines)
+        self.gate_tau = nn.Linear(network.cosines, network.head)
         if measure is not None:
-            self.gate_beta = nn.Linear(widths.cosines, widths.head, bias=False)
+            self.gate_beta = nn.Linear(network.cosines, network.head, bias=False)
             # One linear layer over both halves draws from its whole fan-in: so do its halves.
-            bound = 1.0 / math.sqrt(2 * widths.cosines)
+            bound = 1.0 / math.sqrt(2 * network.cosines)
             for parameter in (self.gate_tau.weight, self.gate_tau.bias, self.gate_beta.weight):
                 nn.init.uniform_(parameter, -bound, bound)
-        self.hidden = nn.Linear(widths.head, widths.head)
-        self.output = nn.Linear(widths.head, 1)
+        self.hidden = nn.Linear(network.head, network.head)
+        self.output = nn.Linear(network.head, 1)
 
     def forward(self, memory: Tensor, action: Tensor, tau: Tensor, risk: Tensor | None = None) -> Tensor:
         """Return the quantiles ``[B, L, N]``.
@@ -282,15 +287,15 @@ class ScalarHead(nn.Module):
 
     Args:
         action_size: number of action dimensions.
-        widths: layer widths.
+        network: sizes of the layers.
     """
 
-    def __init__(self, action_size: int, widths: Widths) -> None:
+    def __init__(self, action_size: int, network: NetworkSettings) -> None:
         """Build the layers."""
         super().__init__()
-        self.input = nn.Linear(widths.memory + action_size, widths.head)
-        self.hidden = nn.Linear(widths.head, widths.head)
-        self.output = nn.Linear(widths.head, 1)
+        self.input = nn.Linear(network.memory + action_size, network.head)
+        self.hidden = nn.Linear(network.head, network.head)
+        self.output = nn.Linear(network.head, 1)
 
     def forward(self, memory: Tensor, action: Tensor) -> Tensor:
         """Return the value ``[.., 1]``."""

@@ -10,7 +10,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.compose import choices
 from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
@@ -56,7 +56,7 @@ class AgentOfRun:
 
     algo: AlgoSettings
     sensor: SensorSettings
-    network: Widths
+    network: NetworkSettings
     task: TaskSettings
 
 
@@ -91,10 +91,17 @@ def _of_run(folder: Path, key: str, reader: Callable[[dict[str, Any]], Settings]
         cfg = OmegaConf.load(path)
         if not isinstance(cfg, DictConfig):
             raise UserInputError("it holds no keys")
-        return reader(plain(cfg))
+        return reader(_completed(plain(cfg)))
     except (OSError, ValueError, TypeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())
         raise UserInputError(f"{path} cannot be read ({reason}): name a folder that this version wrote") from error
+
+
+def _completed(values: dict[str, Any]) -> dict[str, Any]:
+    """Add what runs of earlier versions do not say: their networks padded no ring."""
+    if isinstance(network := values.get("network"), dict):
+        values["network"] = {"padding": "none"} | network
+    return values
 
 
 def plain(cfg: DictConfig) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
@@ -97,7 +97,7 @@ class TrainingSettings:
     device: str
     threads: Threads
     world: TeamSettings
-    network: Widths
+    network: NetworkSettings
     learner: LearnerSettings
     replay: ReplaySettings
     schedule: Schedule

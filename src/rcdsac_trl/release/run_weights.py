@@ -72,11 +72,12 @@ def _config(agent: AgentOfRun, num_critics: int, provenance: dict[str, str | int
         measure=algo.distortion.name,
         embedding=None if measure is None else _embedding(measure),
         fixed_beta=algo.beta,
-        network=vars(agent.network),
+        network=agent.network.widths,
         period_s=(min(task.motor_steps) * MOTOR_PERIOD_S, max(task.motor_steps) * MOTOR_PERIOD_S),
         waypoint_radius_m=task.waypoint_radius_m,
         goal_radius_m=task.goal_radius_m,
         provenance=provenance,
+        padding=agent.network.padding,
     )
 
 

@@ -26,13 +26,13 @@ def packed(actor: nn.Module) -> bytes:
 
 def make_loss(settings: TrainingSettings, device: str) -> LossModule:
     """Make actor, critics and their loss, with weights from the stream ``"weights"``."""
-    algo, learner, widths = settings.algo, settings.learner, settings.network
+    algo, learner, network = settings.algo, settings.learner, settings.network
     # Layers draw their first weights from torch's global generator: lend it our stream, and give it back.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(torch_seed(settings.seed, "weights"))
         actor = _build_actor(settings)
         critics = [
-            build_critic(ACTION_SIZE, _vectors(settings), algo.critic, algo.network_measure, widths)
+            build_critic(ACTION_SIZE, _vectors(settings), algo.critic, algo.network_measure, network)
             for _ in range(learner.num_critics)
         ]
     loss = DistributionalSACLoss(

@@ -70,7 +70,7 @@ def _layer(inputs: Floats, weights: Floats, bias: Floats, out: Floats) -> None:
 
 @_compiled
 def _range_features(bins: Floats, weights: "Weights", out: Floats) -> None:
-    """Write the features of one observation: both convolutions and the linear layer."""
+    """Write the features of one observation, its bins padded: both convolutions and the linear layer."""
     taps, channels = weights.conv_1.shape
     positions = weights.linear.shape[0]
     first = np.empty((2 * positions + 1, channels), np.float32)
@@ -272,7 +272,7 @@ class CompiledActor:
         size = self._head.output.out_features // 2
         loc, scale, action = torch.empty(3, number, size).unbind()
         _act(
-            range_.contiguous().numpy(),
+            self._encoder.range.padded(range_).contiguous().numpy(),
             torch.cat(list(vectors), dim=-1).numpy(),
             embedded.view(-1).numpy(),
             following.numpy(),

@@ -94,7 +94,8 @@ def observation_features(
     Bins that are 0 in the whole batch cost nothing where their windows hold no other: a narrow sensor's do.
 
     Args:
-        bins: ``[n, bins]``, at least one; data, so no gradient flows to them, nor to the vectors.
+        bins: ``[n, bins]``, at least one, padded as the layers read them; data, so no gradient flows to them, nor
+            to the vectors.
         vectors: ``[n, size]`` each.
         range_layers: a convolution of kernel 5 and stride 2 with one input channel, one of kernel 3 and stride
             2, and a linear layer that reads the positions of the second, position by position; rectifiers between.

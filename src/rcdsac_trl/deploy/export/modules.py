@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from rcdsac_trl.agent.networks import ActorHead, Encoder, QuantileHead, ScalarHead, Widths
+from rcdsac_trl.agent.networks import ActorHead, Encoder, NetworkSettings, QuantileHead, ScalarHead
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights
 
@@ -19,9 +19,9 @@ class ActorStep(nn.Module):
 
     def __init__(self, weights: Weights) -> None:
         super().__init__()
-        config, widths = weights.config, Widths(**weights.config.network)
-        self.encoder = Encoder(config.vectors, widths)
-        self.head = ActorHead(ACTION_SIZE, widths, measure_of(config))
+        config, network = weights.config, _network_of(weights.config)
+        self.encoder = Encoder(config.vectors, network)
+        self.head = ActorHead(ACTION_SIZE, network, measure_of(config))
         self.weighted = config.context == "collision_weight"
         _load(self.encoder, weights, "actor.encoder")
         _load(self.head, weights, "actor.head")
@@ -55,10 +55,10 @@ class CriticStep(nn.Module):
 
     def __init__(self, weights: Weights, fractions: Tensor) -> None:
         super().__init__()
-        config, widths = weights.config, Widths(**weights.config.network)
+        config, network = weights.config, _network_of(weights.config)
         numbers = range(config.num_critics)
-        self.encoders = nn.ModuleList(Encoder(config.vectors, widths) for _ in numbers)
-        self.heads = nn.ModuleList(_critic_head(config, widths) for _ in numbers)
+        self.encoders = nn.ModuleList(Encoder(config.vectors, network) for _ in numbers)
+        self.heads = nn.ModuleList(_critic_head(config, network) for _ in numbers)
         self.weighted = config.context == "collision_weight"
         self.register_buffer("fractions", fractions.reshape(1, 1, -1))
         for number in numbers:
@@ -97,10 +97,14 @@ def measure_of(config: AgentConfig) -> RiskMeasure | None:
     return make_measure(config.measure) if config.context == "beta" else None
 
 
-def _critic_head(config: AgentConfig, widths: Widths) -> nn.Module:
+def _network_of(config: AgentConfig) -> NetworkSettings:
+    return NetworkSettings(**config.network, padding=config.padding)
+
+
+def _critic_head(config: AgentConfig, network: NetworkSettings) -> nn.Module:
     if config.critic == "scalar":
-        return ScalarHead(ACTION_SIZE, widths)
-    return QuantileHead(ACTION_SIZE, widths, measure_of(config))
+        return ScalarHead(ACTION_SIZE, network)
+    return QuantileHead(ACTION_SIZE, network, measure_of(config))
 
 
 def _encode(

@@ -80,7 +80,9 @@ class Policy:
         self._default_weight = middle if self.config.context == "collision_weight" else None
         self._mask = sensor_mask(self.config.sensor)
         parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
-        self._encoders = Encoders([weights.part(f"{part}.encoder") for part in parts], self._mask)
+        self._encoders = Encoders(
+            [weights.part(f"{part}.encoder") for part in parts], self._mask, weights.config.padding
+        )
         self._actor = Actor(weights)
         self._critics = Critics(weights, self.fractions)
         self._halted = False
