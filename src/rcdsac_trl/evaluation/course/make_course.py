@@ -27,6 +27,7 @@ from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.office.building import COURSE_M, make_office
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
+from rcdsac_trl.world.task.rules import RULES_VERSION
 
 # What the paper's second table sets each measure to.
 _PAPER_BETAS = {"cvar": (0.25, 0.75), "pow": (-2.0, -1.0)}
@@ -62,6 +63,7 @@ def make_course(cfg: DictConfig) -> CourseRun:
         "time_limit_s": settings.time_limit_s,
         "camera": asdict(settings.camera),
         "odometry": asdict(settings.odometry),
+        "rules_version": RULES_VERSION,
         "commit": commit(),
     }
     return CourseRun(
