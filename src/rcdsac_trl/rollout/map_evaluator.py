@@ -99,7 +99,8 @@ def driver(
     team = evaluation_team(
         course.world, algo, course.conditions, course.split, course.seed, course.num_episodes, memory
     )
-    noise = AgentNoise(range(len(course.conditions) * course.num_episodes))
+    # An episode's noise is its own: the same under every condition, whichever they are and in whatever order.
+    noise = AgentNoise([*range(course.num_episodes)] * len(course.conditions))
     policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
     more: list[Measure] = [partial(_trips, course)] if course.trips else []
     if course.controller is not None:

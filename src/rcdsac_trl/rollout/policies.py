@@ -29,7 +29,7 @@ class AgentNoise:
     So an agent's noise does not depend on which others there are, nor on who holds it.
 
     Args:
-        agent_ids: numbers of the agents, in the order of the flattened batch.
+        agent_ids: numbers of the agents, in the order of the flattened batch; equal numbers draw equal noise.
 
     Example:
         >>> noise = AgentNoise([3, 4])
