@@ -20,7 +20,7 @@ from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.world.maps.generator import Map
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M, segment_clearance
 from rcdsac_trl.world.sim import bodies
-from rcdsac_trl.world.sim.bullet import pybullet
+from rcdsac_trl.world.sim.bullet import Client, pybullet
 from rcdsac_trl.world.sim.lidar import scan
 from rcdsac_trl.world.sim.movers import Movers, WalkPlanner
 
@@ -67,7 +67,7 @@ class StepResult(NamedTuple):
 
 
 class Simulation:
-    """One robot in one PyBullet client.
+    """One robot in one PyBullet client, which is freed with it or when it is closed.
 
     Equal loads and steps give bit-identical results, whatever the client simulated before.
 
@@ -91,10 +91,8 @@ class Simulation:
 
     def __init__(self, gui: bool = False) -> None:
         self._gui = gui
-        try:
-            self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        except pybullet.error:
-            self._client = -1
+        self._connection = Client(pybullet.GUI if gui else pybullet.DIRECT)
+        self._client = self._connection.number
         if self._client < 0 and not gui:
             raise UserInputError("PyBullet opens no more simulations in one process: use fewer agents or more workers")
         if self._client < 0:
@@ -241,9 +239,8 @@ class Simulation:
 
     def close(self) -> None:
         """Disconnect from PyBullet; harmless when done before."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        self._connection.close()
+        self._client = -1
 
     def _sync_movers(self, robot_x: float, robot_y: float, everywhere: bool) -> None:
         """Tell PyBullet where the movers are: all of them, or only those that the robot could touch."""

@@ -15,6 +15,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.processes import START_METHOD, resolve_num_workers
 from rcdsac_trl.world.maps.generator import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
+from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task.agent_group import AgentGroup
 from rcdsac_trl.world.task.parallel import Workers, worker_env
 from rcdsac_trl.world.task.rules import TaskSettings
@@ -23,7 +24,7 @@ from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, Space
 COLLISION_WEIGHT = "collision_weight"
 
 
-class NavigationEnv(EnvBase):
+class NavigationEnv(OfOneProcess, EnvBase):
     """Several agents, each in its own simulation of the same map, stepped as one batch.
 
     Agents neither see nor touch each other. Agent ``i`` spends its episode ``k`` on map ``k`` of the split; a
@@ -37,6 +38,8 @@ class NavigationEnv(EnvBase):
     Reward: the paper's (section Reward), from ``reward_components``.
 
     Finish condition: none, ``terminated`` is never true; add ``StepCounter(max_steps=task.episode_steps)``.
+
+    It can be neither copied nor pickled: its simulations live in PyBullet. They are freed by :meth:`close`, or with it.
 
     Args:
         map_settings: how maps are generated.
