@@ -33,7 +33,7 @@ NUM_FRACTIONS = 100
 
 def fractions() -> Tensor:
     """Return the fractions ``[100]`` at which predictions are read: the middles of 100 equal parts of [0, 1]."""
-    return (torch.arange(NUM_FRACTIONS) + 0.5) / NUM_FRACTIONS
+    return (torch.arange(NUM_FRACTIONS, dtype=torch.float32) + 0.5) / NUM_FRACTIONS
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def measure_map(
         critics that look back to the episode's start; and the lists `soft_returns` and `discounted_rewards`.
     """
     steps = list(branch_steps) * len(betas)
-    risk = torch.tensor([beta for beta in betas for _ in branch_steps]) if told else None
+    risk = torch.tensor([beta for beta in betas for _ in branch_steps], dtype=torch.float32) if told else None
     with torch.no_grad():
         branches = roll_out(
             env,

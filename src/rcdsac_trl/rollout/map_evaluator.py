@@ -165,7 +165,7 @@ def _trips(course: Course, map_index: int, episodes: TensorDictBase) -> dict[str
     _, planner = load_map(course.world.map_settings, course.split, course.seed, map_index)
     agents = range(course.num_episodes)
     steps = [draw_motor_steps(task, course.split, course.seed, map_index, agent) for agent in agents]
-    period_s = MOTOR_PERIOD_S * torch.tensor(steps * len(course.conditions), dtype=torch.float64)
+    period_s = MOTOR_PERIOD_S * torch.tensor(steps * len(course.conditions), dtype=torch.float64, device="cpu")
     return trip_metrics(episodes, planner, period_s)
 
 

@@ -146,7 +146,7 @@ class DistributionalSACLoss(LinkedLoss):
             raise ValueError(f"target_over_critics = {target_over_critics!r} must be one of {', '.join(OVER_CRITICS)}")
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
-        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init)))
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), dtype=torch.float32, device="cpu"))
         self._link_networks(actor, critics)
         if self._distributional and measure is None:
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
