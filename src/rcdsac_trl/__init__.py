@@ -25,8 +25,11 @@ each other: they meet in these keys, each with the shape of one agent's entry.
 | `recurrent_state` | 128 f32 | zero at reset, not in the replay | actor | actor |
 """
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from rcdsac_trl.world.task import gymnasium_id
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy import Policy
@@ -57,12 +60,16 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
 def register_gym() -> None:
     """Register ``RCDSACNavigation-v0`` with Gymnasium, for ``gymnasium.make``; harmless when done before.
 
+    Needed only where this package is imported before Gymnasium: else importing it registers the name.
+
     Example:
         >>> import gymnasium
         >>> register_gym()
         >>> env = gymnasium.make("RCDSACNavigation-v0", sensor="sparse")
     """
-    # Imported late, so that importing the package stays instant.
-    from rcdsac_trl.world.task import gymnasium_env
+    gymnasium_id.register()
 
-    gymnasium_env.register()
+
+# gymnasium.make("rcdsac_trl:RCDSACNavigation-v0") imports this module first, and then looks for the name.
+if "gymnasium" in sys.modules:
+    register_gym()

@@ -53,6 +53,7 @@ def branches():
             loss.actor_network,
             branch_steps=STEPS,
             num_rollouts=ROLLOUTS,
+            num_blocks=1,
             horizon_steps=HORIZON,
             gamma=GAMMA,
             alpha=0.1,
@@ -80,6 +81,36 @@ def test_returns_are_discounted_from_the_branch_over_the_horizon(branches) -> No
         torch.testing.assert_close(out.discounted_reward[group], expected)
     # The first action was chosen before: its entropy does not count.
     assert not torch.equal(out.soft_return, out.discounted_reward)
+
+
+def test_every_beta_is_rolled_out_with_the_same_noise() -> None:
+    settings = tiny.tiny_settings()
+    env = environment(
+        settings.training_world,
+        settings.algo,
+        split="evaluation",
+        seed=0,
+        agent_ids=[0] * ROLLOUTS * 2,
+        memory=settings.network.memory,
+        conditions=[Condition(beta=-1.0)] * (2 * ROLLOUTS),
+    )
+    with torch.no_grad():
+        out = roll_out(
+            env,
+            make_loss(settings, "cpu").actor_network,
+            branch_steps=[2, 2],
+            num_rollouts=ROLLOUTS,
+            num_blocks=2,
+            horizon_steps=3,
+            gamma=GAMMA,
+            alpha=0.1,
+            generator=torch.Generator().manual_seed(0),
+            episode=0,
+        )
+    env.close()
+    first, second = out.soft_return
+    torch.testing.assert_close(first, second)
+    assert len(set(first.tolist())) == ROLLOUTS
 
 
 def test_predictions_are_those_of_the_loss_on_the_same_window(branches) -> None:

@@ -89,6 +89,17 @@ def test_another_seed_split_or_agent_gives_other_episodes(run: Path, tmp_path: P
     assert len(found) == len(others)
 
 
+def test_sampled_episodes_do_not_depend_on_the_other_betas_nor_on_their_order(run: Path, tmp_path: Path) -> None:
+    def episodes(betas: str, folder: str) -> dict[float, str]:
+        out = evaluate(f"run={run}", f"beta={betas}", "sampled=true", f"out={tmp_path / folder}")
+        rows = pd.read_csv(out / "episodes.csv", index_col="map", dtype={"beta": float})
+        return {float(beta): part.to_csv() for beta, part in rows.groupby("beta")}
+
+    found = episodes("[-2,-1,-0.5]", "a")
+    assert episodes("[-0.5,-2,-1]", "b") == found
+    assert episodes("[-1]", "c")[-1.0] == found[-1.0]
+
+
 def test_it_never_mixes_with_what_another_wrote_meanwhile(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     sizes = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1"]

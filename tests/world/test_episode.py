@@ -23,6 +23,7 @@ class ScriptedPlanner:
     def __init__(self, corners: Sequence[tuple[float, float]] = ()) -> None:
         self.corners = list(corners)
         self.planned_from: list[tuple[float, float]] = []
+        self.wall_x_m: float | None = None
 
     def sample_free(self, rng: np.random.Generator) -> np.ndarray:
         return np.array([1.0, 1.0])
@@ -33,6 +34,10 @@ class ScriptedPlanner:
     def waypoints(self, start: tuple[float, float], goal: np.ndarray) -> np.ndarray:
         self.planned_from.append(tuple(start))
         return np.array([*self.corners, goal])
+
+    def leg_is_free(self, from_xy: tuple[float, float], to_xy: tuple[float, float]) -> bool:
+        """Nothing is in the way but a wall, from which what lies beyond cannot be driven to."""
+        return self.wall_x_m is None or from_xy[0] >= self.wall_x_m
 
 
 class ScriptedSimulation:
@@ -147,6 +152,25 @@ def test_waypoints_are_taken_within_half_a_metre_and_several_at_once(scripted) -
     group, _, _ = scripted([moved(2.8)], corners=[(3.0, 1.0), (3.0, 1.3), (4.2, 3.0)])
     group.step(STRAIGHT_ON)
     assert group.scene(0).waypoints.tolist() == [[4.2, 3.0], [5.0, 1.0]]
+
+
+def test_a_waypoint_stays_until_the_way_to_the_one_after_it_is_free(scripted) -> None:
+    group, planner, _ = scripted([moved(2.6), moved(2.7), moved(2.8)], corners=[(3.0, 1.0), (3.0, 3.0)])
+    planner.wall_x_m = 2.75
+    ahead = []
+    for _ in range(3):
+        group.step(STRAIGHT_ON)
+        ahead.append(len(group.scene(0).waypoints))
+    assert ahead == [3, 3, 2]
+
+
+def test_a_waypoint_that_is_reached_gives_way_whatever_is_in_the_way(scripted) -> None:
+    group, planner, _ = scripted([moved(2.8), moved(2.86)], corners=[(3.0, 1.0), (3.0, 3.0)])
+    planner.wall_x_m = 9.0
+    group.step(STRAIGHT_ON)
+    assert len(group.scene(0).waypoints) == 3
+    group.step(STRAIGHT_ON)
+    assert len(group.scene(0).waypoints) == 2
 
 
 def test_a_step_is_paid_for_the_waypoint_that_was_next_while_it_was_taken(scripted) -> None:

@@ -2,19 +2,23 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 import rcdsac_trl
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.task.env import NavigationEnv
-from rcdsac_trl.world.task.gymnasium_env import ENV_ID, NavigationGymEnv
+from rcdsac_trl.world.task.gymnasium_env import NavigationGymEnv
+from rcdsac_trl.world.task.gymnasium_id import ENV_ID
 from rcdsac_trl.world.task.rules import TaskSettings
 
 SMALL = MapSettings(size_m=12.0, layouts=("clutter",), clutter_per_m2=0.08, num_movers=1)
@@ -27,6 +31,10 @@ def test_gymnasiums_own_check_passes(sensor: str) -> None:
     env.close()
 
 
+def run(code: str) -> None:
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_the_id_is_registered_on_request_and_not_before() -> None:
     code = (
         "import sys, rcdsac_trl\n"
@@ -36,13 +44,77 @@ def test_the_id_is_registered_on_request_and_not_before() -> None:
         "import gymnasium\n"
         f"assert gymnasium.spec({ENV_ID!r}).entry_point == 'rcdsac_trl.world.task.gymnasium_env:NavigationGymEnv'\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    run(code)
     rcdsac_trl.register_gym()
 
 
-def test_gymnasium_imports_the_module_that_an_id_names() -> None:
-    env = gymnasium.make(f"rcdsac_trl.world.task.gymnasium_env:{ENV_ID}", map_settings=SMALL)
-    assert isinstance(env.unwrapped, NavigationGymEnv)
+@pytest.mark.parametrize(
+    "made",
+    [
+        f"gymnasium.make('rcdsac_trl:{ENV_ID}')",
+        f"gymnasium.make('rcdsac_trl.world.task.gymnasium_env:{ENV_ID}')",
+        f"(importlib.import_module('rcdsac_trl'), gymnasium.make('{ENV_ID}'))[1]",
+    ],
+)
+def test_gymnasium_finds_the_id_in_the_package_that_it_names(made: str) -> None:
+    run(f"import gymnasium, importlib\nassert type({made}.unwrapped).__name__ == 'NavigationGymEnv'")
+
+
+# Seeds
+
+
+@pytest.mark.parametrize("kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")])
+def test_without_seeds_the_worlds_of_a_vector_differ_and_can_be_met_again(kind: Callable) -> None:
+    envs = kind([partial(NavigationGymEnv, SMALL)] * 3)
+    _, infos = envs.reset()
+    assert len({tuple(pose) for pose in infos["pose"].tolist()}) == 3
+    # The seed that an environment drew is told, and gives its world again.
+    again, told = envs.reset(seed=infos["seed"].tolist())
+    assert np.array_equal(told["pose"], infos["pose"])
+    _, from_one = envs.reset(seed=5)
+    assert from_one["seed"].tolist() == [5, 6, 7]
+    envs.close()
+    other = kind([partial(NavigationGymEnv, SMALL)] * 3)
+    assert not np.array_equal(other.reset()[1]["pose"], infos["pose"])
+    assert np.array_equal(other.reset(seed=infos["seed"].tolist())[0]["range"], again["range"])
+    other.close()
+
+
+def test_a_reset_without_a_seed_goes_on_under_the_seed_that_there_is() -> None:
+    env, other = NavigationGymEnv(SMALL), NavigationGymEnv(SMALL, seed=3)
+    _, first = env.reset()
+    assert first["seed"] == env.np_random_seed
+    _, second = env.reset()
+    assert (second["seed"], first["episode"], second["episode"]) == (first["seed"], 0, 1)
+    assert not np.array_equal(first["pose"], second["pose"])
+    _, named = other.reset(seed=first["seed"], options={"episode": 1})
+    assert np.array_equal(named["pose"], second["pose"])
+    assert env.step(np.zeros(2, np.float32))[4]["episode"] == 1
+    env.close()
+    other.close()
+    given = NavigationGymEnv(SMALL, seed=3)
+    assert given.reset()[1]["seed"] == given.np_random_seed == 3
+    given.close()
+
+
+def test_a_generator_that_a_user_has_brought_decides_and_stays() -> None:
+    seeds = []
+    for _ in range(2):
+        env = NavigationGymEnv(SMALL)
+        env.np_random = np.random.default_rng(8)
+        seeds.append(env.reset()[1]["seed"])
+        assert env.np_random_seed == -1  # Gymnasium's sign of a generator that was brought
+        env.close()
+    assert seeds[0] == seeds[1]
+
+
+def test_actions_are_drawn_by_their_own_seed() -> None:
+    env = NavigationGymEnv(SMALL)
+    drawn = []
+    for _ in range(2):
+        env.action_space.seed(2)
+        drawn.append(env.action_space.sample())
+    assert np.array_equal(*drawn)
     env.close()
 
 

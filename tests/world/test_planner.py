@@ -326,6 +326,18 @@ def test_a_robot_against_a_wall_finds_its_way(x: float) -> None:
         assert clearance_along(a, b, planner.map) >= ROBOT_RADIUS_M
 
 
+def test_a_leg_is_free_where_it_keeps_the_robots_radius_from_what_is_known() -> None:
+    post = Cylinder(5.0, 5.0, 0.5, True)
+    planner = Planner(room(post, Cylinder(8.0, 5.0, 0.5, False)))
+    past = [((2.0, y), (6.9, y)) for y in (5.76, 5.74, 5.0)]  # the post's edge and the robot's radius are 5.75 m
+    assert [planner.leg_is_free(*leg) for leg in past] == [True, False, False]
+    assert planner.leg_is_free((7.0, 5.0), (9.0, 5.0))  # the planner does not know what stands there
+    # A robot 0.24 m from the post may drive away from it, and along it, but come no nearer.
+    assert planner.leg_is_free((4.26, 5.0), (2.0, 5.0))
+    assert planner.leg_is_free((4.26, 5.0), (4.26, 8.0))
+    assert not planner.leg_is_free((4.26, 5.0), (4.4, 8.0))
+
+
 def test_less_waypoint_clearance_leads_closer_around_corners() -> None:
     map_ = generate_map(replace(MapSettings(), num_movers=0), "train", 0, 1)
     rng = stream(0, "test")

@@ -118,15 +118,65 @@ def test_wall_stops_the_robot(simulation):
     assert abs(result.v_c) < 1e-3
 
 
-def test_contact_ends_when_the_robot_backs_off(simulation):
+def onsets(simulation, commands, motor_steps=7):
+    """Drive; return in how many steps a contact began, and whether the last step was in contact."""
+    touching, begun = False, 0
+    for v, omega in commands:
+        before, touching = touching, simulation.step(v, omega, motor_steps).in_contact
+        begun += touching and not before
+    return begun, touching
+
+
+def test_contact_ends_some_time_after_the_robot_has_backed_off(simulation):
     load(simulation, room(), (7.5, 4.0, 0.0))
     for _ in range(30):
         simulation.step(0.6, 0.0, 7)
-    simulation.step(-0.2, 0.0, 7)
-    for _ in range(5):
-        result = simulation.step(-0.2, 0.0, 7)
-        assert not result.in_contact
-    assert result.v_c == pytest.approx(-0.2, abs=1e-9)
+    # While it speeds up it backs off 0.02 * (0.03 + 0.06 + .. + 0.18 + 0.2) = 0.0166 m, less than the 0.019 m by which
+    # its corners stick out beyond its flat side. From the second step on they are more than 0.005 m from the wall,
+    # and three such steps are 0.42 s.
+    results = [simulation.step(-0.2, 0.0, 7) for _ in range(6)]
+    assert [result.in_contact for result in results] == [True, True, True, False, False, False]
+    assert results[-1].v_c == pytest.approx(-0.2, abs=1e-9)
+
+
+@pytest.mark.parametrize("motor_steps", [6, 8])
+@pytest.mark.parametrize("omega", [1.5, -0.8, 0.27])
+@pytest.mark.parametrize("gap_m", [0.0, 0.0015])
+def test_turning_on_the_spot_beside_a_wall_is_one_contact(simulation, gap_m, omega, motor_steps):
+    load(simulation, room(), (8.0 - APOTHEM_M - gap_m, 4.0, 0.0))
+    assert onsets(simulation, [(0.0, omega)] * 300, motor_steps) == (1, True)
+
+
+def test_turning_on_the_spot_beside_a_cylinder_is_one_contact(simulation):
+    load(simulation, room(cylinders=[Cylinder(4.0, 4.0, 0.3, True)]), (4.0 + 0.3 + APOTHEM_M + 1e-3, 4.0, 0.0))
+    assert onsets(simulation, [(0.0, 1.2)] * 200) == (1, True)
+
+
+def test_sliding_along_a_wall_is_one_contact(simulation):
+    load(simulation, room(), (7.5, 1.0, math.radians(60.0)))
+    # It turns a little to and fro, and so away from the wall and back.
+    swaying = [(0.6, 0.4 * math.sin(step)) for step in range(60)]
+    assert onsets(simulation, swaying) == (1, True)
+
+
+def test_leaving_a_wall_and_coming_back_is_two_contacts(simulation):
+    load(simulation, room(), (7.5, 4.0, 0.0))
+    push, leave = [(0.6, 0.0)] * 15, [(-0.2, 0.0)] * 8
+    assert onsets(simulation, push + leave) == (1, False)
+    assert onsets(simulation, push) == (1, True)
+
+
+def test_twitching_at_a_wall_is_one_contact(simulation):
+    load(simulation, room(), (7.5, 4.0, 0.0))
+    twitching = [(0.6, 0.0)] * 15 + [(-0.2, 0.0), (0.6, 0.5), (0.6, -0.5)] * 20
+    assert onsets(simulation, twitching) == (1, True)
+
+
+def test_a_load_begins_without_contact(simulation):
+    load(simulation, room(), (8.0 - APOTHEM_M, 4.0, 0.0))
+    assert simulation.step(0.6, 0.0, 7).in_contact
+    load(simulation, room(), (7.7, 4.0, 0.0))
+    assert not simulation.step(0.0, 0.0, 7).in_contact
 
 
 def test_no_contact_while_there_is_a_gap(simulation):

@@ -255,6 +255,7 @@ def test_settings_turn_lists_into_tuples():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
+        ("version", 1),
         ("episode_steps", 0),
         ("collision_penalty_mode", "never"),
         ("waypoint_radius_m", 0.0),

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rcdsac_trl.agent.float32 import made_in_float32
 from rcdsac_trl.agent.kernels.observation_features import observation_features
 from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
 from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
@@ -74,6 +75,7 @@ class NetworkSettings:
         return {name: value for name, value in vars(self).items() if isinstance(value, int)}
 
 
+@made_in_float32
 class RangeFeatures(nn.Module):
     """Two strided convolutions and a linear layer over the ring of bins: ``[n, 180] -> [n, features]``.
 
@@ -115,6 +117,7 @@ class RangeFeatures(nn.Module):
         return F.relu(self.linear(positions.transpose(1, 2).flatten(1)))
 
 
+@made_in_float32
 class Encoder(nn.Module):
     """Observation history to memory: per-input features, concatenated, into a GRU.
 
@@ -171,6 +174,7 @@ class Encoder(nn.Module):
         return torch.cat(parts, dim=-1)
 
 
+@made_in_float32
 class CosineFeatures(nn.Module):
     r"""Cosine embedding: ``[..] -> [.., n]`` with elements :math:`\cos(\pi i x)`, i = 1..n, for x in [0, 1]."""
 
@@ -186,6 +190,7 @@ class CosineFeatures(nn.Module):
         return torch.cos(x.unsqueeze(-1) * self.frequencies)
 
 
+@made_in_float32
 class ActorHead(nn.Module):
     r"""Memory (and ``beta``) to the mean and the standard deviation of the pre-tanh action.
 
@@ -220,6 +225,7 @@ class ActorHead(nn.Module):
         return loc, log_std.clamp(*LOG_STD_RANGE).exp()
 
 
+@made_in_float32
 class QuantileHead(nn.Module):
     r"""Memory, action and fractions to the quantiles of the return.
 
@@ -282,6 +288,7 @@ class QuantileHead(nn.Module):
         return self.output(F.relu(self.hidden(x.unsqueeze(2) * F.relu(gate)))).squeeze(-1)
 
 
+@made_in_float32
 class ScalarHead(nn.Module):
     """Memory and action to one value, the mean return: the critic of SAC and RCWR.
 

@@ -114,7 +114,9 @@ class RiskMeasure(ABC):
 
     def sample(self, shape: Sequence[int], generator: torch.Generator) -> Tensor:
         """Draw ``beta`` uniformly over [``low``, ``high``], float32 of ``shape`` on the generator's device."""
-        return self.from_uniform(torch.rand(tuple(shape), generator=generator, device=generator.device))
+        return self.from_uniform(
+            torch.rand(tuple(shape), generator=generator, device=generator.device, dtype=torch.float32)
+        )
 
     def temper(self, beta: Scalar, strength: float) -> Scalar:
         """Move ``beta`` towards neutral: strength 0 gives the neutral value, 1 leaves ``beta`` as it is.

@@ -61,11 +61,12 @@ class EpisodeSampler(Transform):
         self.agent_ids = tuple(agent_ids)
         self.fixed = fixed
         self._next_episodes = [first_episode] * len(self.agent_ids)
-        self._told = torch.zeros(len(self.agent_ids), 1)
+        self._told = torch.zeros(len(self.agent_ids), 1, dtype=torch.float32, device="cpu")
 
     def told(self, episode: int) -> Tensor:
         """Return what all agents are told in an episode, ``[N, 1]``."""
-        return torch.tensor([[self._of(row, episode)] for row in range(len(self.agent_ids))])
+        numbers = [[self._of(row, episode)] for row in range(len(self.agent_ids))]
+        return torch.tensor(numbers, dtype=torch.float32, device="cpu")
 
     def _of(self, row: int, episode: int) -> float:
         if self.fixed is not None:
@@ -87,7 +88,9 @@ class EpisodeSampler(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the key to the observations."""
-        observation_spec[self.key] = Unbounded((*observation_spec.shape, 1), device=observation_spec.device)
+        observation_spec[self.key] = Unbounded(
+            (*observation_spec.shape, 1), device=observation_spec.device, dtype=torch.float32
+        )
         return observation_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -139,7 +142,7 @@ class Relabel:
         """Set `risk` ``[B, L + 1, 1]``."""
         sequences, slots = batch.shape
         if self.mode == "fixed" and self.beta is not None:
-            one = torch.full((1, 1, 1), self.beta, device=batch.device)
+            one = torch.full((1, 1, 1), self.beta, device=batch.device, dtype=torch.float32)
             return batch.set("risk", one.expand(sequences, slots, 1))
         if self.mode == "resample" and self.generator is not None:
             drawn = self.measure.sample((sequences, slots if self.per == "transition" else 1, 1), self.generator)

@@ -25,7 +25,7 @@ NUM_FRACTIONS = 100
 
 def fractions() -> Tensor:
     """Return the fractions ``[100]`` at which predictions are read: the middles of 100 equal parts of [0, 1]."""
-    return (torch.arange(NUM_FRACTIONS) + 0.5) / NUM_FRACTIONS
+    return (torch.arange(NUM_FRACTIONS, dtype=torch.float32) + 0.5) / NUM_FRACTIONS
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ def roll_out(
     *,
     branch_steps: Sequence[int],
     num_rollouts: int,
+    num_blocks: int,
     horizon_steps: int,
     gamma: float,
     alpha: float,
@@ -66,6 +67,8 @@ def roll_out(
         actor: encoder and head; its actions are drawn.
         branch_steps: G numbers k: the group does the same up to action k, and nothing together from then on.
         num_rollouts: M, agents in a group.
+        num_blocks: equal blocks of the groups, whose agents draw the same noise: one a beta, so that no beta's depends
+            on which others there are.
         horizon_steps: h.
         gamma: discount.
         alpha: temperature.
@@ -84,7 +87,7 @@ def roll_out(
         before_step()
         state = encoder.module.step(*[tensordict[key] for key in (*encoder.in_keys, "is_init", STATE_KEY)])
         loc, scale = head.module(state, *[tensordict[key] for key in head.in_keys[1:]])
-        noise = torch.empty_like(loc).normal_(generator=generator)
+        noise = torch.empty_like(loc[: len(loc) // num_blocks]).normal_(generator=generator).repeat(num_blocks, 1)
         action, log_prob = squash(loc, scale, noise)
         # Of equal rows a matrix product need not make equal bits.
         action = torch.where((step <= parting).unsqueeze(-1), action[leader], action)
@@ -179,13 +182,14 @@ def measure_states(
         critics that look back to the episode's start; and the lists `soft_returns` and `discounted_rewards`.
     """
     steps = list(branch_steps) * len(betas)
-    risk = torch.tensor([beta for beta in betas for _ in branch_steps]) if conditioned else None
+    risk = torch.tensor([beta for beta in betas for _ in branch_steps], dtype=torch.float32) if conditioned else None
     with torch.no_grad():
         branches = roll_out(
             env,
             loss.actor_network,
             branch_steps=steps,
             num_rollouts=num_rollouts,
+            num_blocks=len(betas),
             horizon_steps=horizon_steps,
             gamma=gamma,
             alpha=loss.alpha.item(),

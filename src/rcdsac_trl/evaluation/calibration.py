@@ -26,6 +26,7 @@ from rcdsac_trl.storage.checkpoint_record import find
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.provenance import commit
+from rcdsac_trl.world.task.rules import RULES_VERSION
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 
@@ -99,6 +100,7 @@ def _described(
         "gamma": trained.learner.gamma,
         "target_over_critics": trained.learner.target_over_critics,
         "conditions": [str(condition) for condition in conditions],
+        "rules_version": RULES_VERSION,
         "commit": commit(),
     }
 

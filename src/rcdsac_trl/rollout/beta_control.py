@@ -51,7 +51,7 @@ class AdaptivePolicy(TensorDictModuleBase):
         betas = [
             controller(distances[row], self._quantiles.get(row)) for row, controller in enumerate(self.controllers)
         ]
-        told = torch.tensor(betas, dtype=torch.float64)
+        told = torch.tensor(betas, dtype=torch.float64, device="cpu")
         self.told.append(told)
         tensordict = self.policy(tensordict.set("risk", told.float().unsqueeze(1)))
         if self.predictor is not None:

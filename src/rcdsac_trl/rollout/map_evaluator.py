@@ -99,7 +99,8 @@ def driver(
     team = evaluation_team(
         course.world, algo, course.conditions, course.split, course.seed, course.num_episodes, memory
     )
-    noise = AgentNoise(range(len(course.conditions) * course.num_episodes))
+    # An episode's noise is its own: the same under every condition, whichever they are and in whatever order.
+    noise = AgentNoise([*range(course.num_episodes)] * len(course.conditions))
     policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
     more: list[Measure] = [partial(_trips, course)] if course.trips else []
     if course.controller is not None:
@@ -164,7 +165,7 @@ def _trips(course: Course, map_index: int, episodes: TensorDictBase) -> dict[str
     _, planner = load_map(course.world.map_settings, course.split, course.seed, map_index)
     agents = range(course.num_episodes)
     steps = [draw_motor_steps(task, course.split, course.seed, map_index, agent) for agent in agents]
-    period_s = MOTOR_PERIOD_S * torch.tensor(steps * len(course.conditions), dtype=torch.float64)
+    period_s = MOTOR_PERIOD_S * torch.tensor(steps * len(course.conditions), dtype=torch.float64, device="cpu")
     return trip_metrics(episodes, planner, period_s)
 
 

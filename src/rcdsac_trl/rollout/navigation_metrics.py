@@ -48,7 +48,7 @@ def trip_metrics(episodes: TensorDictBase, planner: Planner, period_s: Tensor) -
     pose = torch.cat([episodes["pose"][:, :1], after["pose"]], 1).double()
     rows = zip(pose, after["contact"].squeeze(-1), after["goal_reached"].squeeze(-1), strict=True)
     trips = [_trip(*row, planner, period) for row, period in zip(rows, period_s.tolist(), strict=True)]
-    return {key: torch.tensor([trip[key] for trip in trips], dtype=torch.float64) for key in TRIP_METRICS}
+    return {key: torch.tensor([trip[key] for trip in trips], dtype=torch.float64, device="cpu") for key in TRIP_METRICS}
 
 
 def _trip(pose: Tensor, contact: Tensor, reached: Tensor, planner: Planner, period_s: float) -> dict[str, float]:

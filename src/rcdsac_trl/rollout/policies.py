@@ -29,7 +29,7 @@ class AgentNoise:
     So an agent's noise does not depend on which others there are, nor on who holds it.
 
     Args:
-        agent_ids: numbers of the agents, in the order of the flattened batch.
+        agent_ids: numbers of the agents, in the order of the flattened batch; equal numbers draw equal noise.
 
     Example:
         >>> noise = AgentNoise([3, 4])
@@ -41,7 +41,7 @@ class AgentNoise:
     def __init__(self, agent_ids: Sequence[int]) -> None:
         self.agent_ids = tuple(agent_ids)
         self._streams: list[np.random.Generator] = []
-        self._block = torch.empty(0, len(self.agent_ids), ACTION_SIZE)
+        self._block = torch.empty(0, len(self.agent_ids), ACTION_SIZE, dtype=torch.float32)
         self._used = 0
 
     def begin(self, seed: int, purpose: str, *index: int) -> None:
@@ -151,7 +151,7 @@ class CollectionPolicy(TensorDictModuleBase):
         self.pursuit_noise = pursuit_noise
         self._pursuing = False
         self._pursuit_draws = AgentNoise(noise.agent_ids)
-        self._lasting = torch.zeros(())
+        self._lasting = torch.zeros((), dtype=torch.float32, device="cpu")
 
     def set_iteration(self, iteration: int) -> None:
         """Choose the driver and the noise of an iteration."""

@@ -93,8 +93,8 @@ class Team:
         weights = told[COLLISION_WEIGHT].view(-1).numpy() if COLLISION_WEIGHT in told else None
         # Made once: the agents write into the same arrays at every step.
         now = TensorDict({key: torch.from_numpy(written[key]) for key in AGENT_OBSERVATIONS} | told, [number])
-        now["is_init"] = torch.ones(number, 1, dtype=torch.bool)
-        now[STATE_KEY] = torch.zeros(number, self.memory)
+        now["is_init"] = torch.ones(number, 1, dtype=torch.bool, device="cpu")
+        now[STATE_KEY] = torch.zeros(number, self.memory, dtype=torch.float32, device="cpu")
         seen = {key: _room(written[key], self.steps + 1) for key in observed}
         done = {key: _room(written[key], self.steps) for key in happened}
         done["action"] = np.empty((number, self.steps, ACTION_SIZE), np.float32)

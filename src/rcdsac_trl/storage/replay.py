@@ -52,7 +52,7 @@ class RangeCodec:
         """Turn ``[..., kept]`` int16 into ``[..., 180]`` float32."""
         level = codes.to(torch.float32) + _OFFSET
         kept = torch.where(level == 0, 0.0, RANGE_LOW + (level - 1) * ((RANGE_HIGH - RANGE_LOW) / _LEVELS))
-        ranges = torch.zeros(*codes.shape[:-1], self.num_bins, device=codes.device)
+        ranges = torch.zeros(*codes.shape[:-1], self.num_bins, device=codes.device, dtype=torch.float32)
         ranges[..., self.bins] = kept
         return ranges
 
@@ -81,10 +81,11 @@ class SequenceSampler(Sampler):
         """Return flat slot indices ``[batch_size]``, sequence after sequence."""
         num_sequences = batch_size // self.sequence_slots
         num_episodes = len(storage) // self.episode_slots
-        episode = torch.randint(num_episodes, (num_sequences,), generator=self._rng)
-        start = torch.randint(self.episode_slots - self.sequence_slots + 1, (num_sequences,), generator=self._rng)
+        episode = torch.randint(num_episodes, (num_sequences,), generator=self._rng, device="cpu")
+        starts = self.episode_slots - self.sequence_slots + 1
+        start = torch.randint(starts, (num_sequences,), generator=self._rng, device="cpu")
         first = episode * self.episode_slots + start
-        return (first.unsqueeze(-1) + torch.arange(self.sequence_slots)).flatten(), {}
+        return (first.unsqueeze(-1) + torch.arange(self.sequence_slots, device="cpu")).flatten(), {}
 
     def state_dict(self) -> dict[str, Any]:
         """There is no state beside the generator, which the buffer owns."""
@@ -225,9 +226,9 @@ class SequenceReplay:
         """
         if first < self.oldest_episode or first + number > self.episodes_added:
             raise ValueError(f"episodes {first} to {first + number - 1} are not all in the replay")
-        episode = torch.arange(first, first + number) % self.capacity_episodes
+        episode = torch.arange(first, first + number, device="cpu") % self.capacity_episodes
         episode_slots = self.episode_steps + 1
-        index = episode.unsqueeze(-1) * episode_slots + torch.arange(episode_slots)
+        index = episode.unsqueeze(-1) * episode_slots + torch.arange(episode_slots, device="cpu")
         return self.buffer.storage[index.flatten()].exclude("index").reshape(number, episode_slots)
 
     def restore(self, first: int, parts: Iterable[TensorDict]) -> None:

@@ -52,7 +52,7 @@ class Scene:
         waypoints: waypoints ahead, [k, 2]; the last one is the goal.
         movers: x, y and radius of each mover, [m, 3].
         trail: positions since the episode began, oldest first.
-        in_contact: whether the robot touches something.
+        in_contact: whether the robot is in contact.
     """
 
     map: Map

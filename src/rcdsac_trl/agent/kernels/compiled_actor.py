@@ -267,16 +267,16 @@ class CompiledActor:
             recurrent state.
         """
         number, measure = len(range_), self._head.measure
-        embedded = torch.zeros(number, 1) if measure is None or risk is None else measure.embed(risk)
+        embedded = range_.new_zeros(number, 1) if measure is None or risk is None else measure.embed(risk)
         following = torch.where(is_init, 0.0, state)
         size = self._head.output.out_features // 2
-        loc, scale, action = torch.empty(3, number, size).unbind()
+        loc, scale, action = range_.new_empty(3, number, size).unbind()
         _act(
             self._encoder.range.padded(range_).contiguous().numpy(),
             torch.cat(list(vectors), dim=-1).numpy(),
             embedded.view(-1).numpy(),
             following.numpy(),
-            (torch.zeros(number, size) if noise is None else noise).numpy(),
+            (range_.new_zeros(number, size) if noise is None else noise).numpy(),
             self._current(bool(is_init.any())),
             loc.numpy(),
             scale.numpy(),

@@ -93,7 +93,9 @@ class DistributionalSACLoss(LinkedLoss):
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
         self.settings = settings or LossSettings()
-        self.log_alpha = nn.Parameter(torch.tensor(math.log(self.settings.alpha_init)))
+        self.log_alpha = nn.Parameter(
+            torch.tensor(math.log(self.settings.alpha_init), dtype=torch.float32, device="cpu")
+        )
         self._link_networks(actor, critics)
         if self._distributional and measure is None:
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")

@@ -20,6 +20,8 @@ from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 from torchrl.objectives.utils import ValueEstimators, dispatch_value_estimator
 
+from rcdsac_trl.agent.float32 import float32_on_cpu
+
 
 class LinkedLoss(LossModule):
     """Parameters in TorchRL's idiom, ``actor_network_params`` and so on, that the networks hold for good.
@@ -80,13 +82,14 @@ class LinkedLoss(LossModule):
         """Set the target's estimator: one-step bootstrapping (TD0) only; ``gamma`` is given here."""
         value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if value_type is not None:
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=self.SUPPORTED_VALUE_ESTIMATORS,
-                tensor_keys={"reward": self.tensor_keys.reward, "terminated": self.tensor_keys.terminated},
-                **hyperparams,
-            )
+            with float32_on_cpu():  # it keeps gamma as a tensor
+                dispatch_value_estimator(
+                    self,
+                    value_type,
+                    supported=self.SUPPORTED_VALUE_ESTIMATORS,
+                    tensor_keys={"reward": self.tensor_keys.reward, "terminated": self.tensor_keys.terminated},
+                    **hyperparams,
+                )
         return self
 
     @property

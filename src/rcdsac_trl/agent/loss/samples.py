@@ -58,13 +58,13 @@ def draw(
     """
 
     def noise() -> Tensor:
-        return torch.randn(action.shape, generator=generator, device=generator.device).to(action)
+        return torch.randn(action.shape, generator=generator, device=generator.device, dtype=torch.float32).to(action)
 
     def fractions(which: int) -> Tensor | None:
         if numbers is None:
             return None
         shape = (len(action), 1 if fractions_per == "sequence" else action.shape[1], numbers[which])
-        drawn = torch.rand(shape, generator=generator, device=generator.device).to(action.device)
+        drawn = torch.rand(shape, generator=generator, device=generator.device, dtype=torch.float32).to(action.device)
         if fraction_sampling == "stratified":
             drawn = (drawn + torch.arange(numbers[which], device=action.device)) / numbers[which]
         return drawn

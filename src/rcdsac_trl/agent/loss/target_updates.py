@@ -54,7 +54,8 @@ class FusedAverage(AveragedModel):
 
     def __init__(self, model: nn.Module, decay: float) -> None:
         """Copy the model."""
-        super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        with torch.device("cpu"):  # its count of updates, which it asks for its number at every step
+            super().__init__(model, multi_avg_fn=get_ema_multi_avg_fn(decay))
         # Detached, not `.data`: the compiled actor sees by PyTorch's count of changes that its weights have moved.
         self._averaged = tuple(parameter.detach() for parameter in self.module.parameters())
         self._followed = tuple(parameter.detach() for parameter in model.parameters())

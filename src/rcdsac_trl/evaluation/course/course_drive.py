@@ -63,7 +63,7 @@ class Trace:
         poses: the robot's true x, y and yaw, m and rad, float64 [n + 1, 3].
         estimates: where it took itself to be, float64 [n + 1, 3].
         people: where people were, m, float64 [n + 1, k, 2].
-        in_contact: whether the robot touched anything since the row before, bool [n + 1].
+        in_contact: whether the robot was in contact since the row before, bool [n + 1].
         nearest_m: true distance from the robot's centre to whatever was nearest, float64 [n + 1].
         distances_m: what the cameras said of each sector before the command, float64 [n, 180].
         velocities: measured velocities before the command, m/s and rad/s, float64 [n, 2].

@@ -35,6 +35,7 @@ from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.maps.shapes import Box
 from rcdsac_trl.world.office.building import COURSE_M, Office, make_office
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
+from rcdsac_trl.world.task.rules import RULES_VERSION
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ def _described(settings: CourseSettings, entries: Sequence[Entry]) -> dict[str, 
         "time_limit_s": settings.time_limit_s,
         "camera": asdict(settings.camera),
         "odometry": asdict(settings.odometry),
+        "rules_version": RULES_VERSION,
         "commit": commit(),
     }
 

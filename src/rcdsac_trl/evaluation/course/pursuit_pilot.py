@@ -24,5 +24,7 @@ class PursuitPilot:
     def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None) -> Command:
         """Return the command towards the first of the waypoints."""
         observed = waypoint_observation((0.0, 0.0, 0.0), *waypoints.tolist())
-        v, omega = desired_velocities(pursuit_action(torch.tensor(observed)).tolist())
+        v, omega = desired_velocities(
+            pursuit_action(torch.tensor(observed, dtype=torch.float32, device="cpu")).tolist()
+        )
         return Command(v, omega, False, None, (v, omega))

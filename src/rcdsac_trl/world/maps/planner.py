@@ -148,6 +148,7 @@ class Planner:
         if not leg_clearance_m(clearance_m) >= robot_radius_m:
             raise UserInputError(f"margin_m={margin_m} is less than a grid of {CELL_M:g} m needs: raise it to 0.02")
         self.map = map
+        self._robot_radius_m = robot_radius_m
         self._true = _Layer(map, clearance_m, clearance_m, reachable_only=True)
         self._known = _Layer(map, clearance_m, max(clearance_m, map.waypoint_clearance_m), mapped_only=True)
         widest_m = max((mover.radius for mover in map.movers), default=robot_radius_m)
@@ -199,6 +200,15 @@ class Planner:
         first, last = self._true.nearest(start_xy), self._true.nearest(goal_xy)
         cells = self._lead_past_the_unknown(self._known.cells_between(first, last))
         return self._known.pull(np.concatenate([[start_xy], self._known.centre(cells), [goal_xy]]))
+
+    def leg_is_free(self, from_xy: Point, to_xy: Point) -> bool:
+        """Return whether the robot can drive straight from where it is to a point, past everything known.
+
+        The straight leg must keep the robot's radius from everything known; a robot that is nearer to something
+        already must come no nearer.
+        """
+        need_m = min(self._robot_radius_m, self._known.clearance(from_xy, from_xy)) - _ROUNDING_M
+        return self._known.clearance(from_xy, to_xy) >= need_m
 
     def _lead_past_the_unknown(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Leave out the cells that are not truly free, and bridge what then has no line of sight."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.maps.shapes import Box, Cylinder
 from rcdsac_trl.world.office.furniture import Solid
-from rcdsac_trl.world.sim.bullet import pybullet
+from rcdsac_trl.world.sim.bullet import Client, pybullet
 
 # Half of the floor's side, around the robot.
 _FLOOR_M = 10.0
@@ -126,7 +126,8 @@ class DepthCameras:
         self._solids = solids
         self._people_m = people_m
         self._rng = rng
-        self._client = pybullet.connect(pybullet.DIRECT)
+        self._connection = Client(pybullet.DIRECT)
+        self._client = self._connection.number
         if self._client < 0:
             raise UserInputError("PyBullet opens no more simulations in one process: lower num_workers")
         self._people: list[int] = []
@@ -180,9 +181,8 @@ class DepthCameras:
 
     def close(self) -> None:
         """Disconnect from PyBullet; harmless when done before."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        self._connection.close()
+        self._client = -1
 
     def _gather(self, xy: tuple[float, float]) -> None:
         """Put into the client what can be seen from around a place, and people."""

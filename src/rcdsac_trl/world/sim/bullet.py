@@ -1,9 +1,13 @@
-"""PyBullet without the line that its import prints: what reads our output should find our output."""
+"""PyBullet without the line that its import prints, and its clients, each with one owner that frees it."""
 
 import importlib
 import os
 import sys
+import weakref
 from types import ModuleType
+from typing import Any, NoReturn
+
+from rcdsac_trl.errors import UserInputError
 
 
 def _import_quietly() -> ModuleType:
@@ -21,3 +25,55 @@ def _import_quietly() -> ModuleType:
 
 
 pybullet = _import_quietly()
+
+
+class OfOneProcess:
+    """What holds a simulation, or leads to one: it is neither copied nor pickled, since PyBullet's state would not be.
+
+    A copy would know the original's client by its number, and move and close the original's world.
+    """
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        """Refuse: ``copy.copy``, ``copy.deepcopy`` and ``pickle`` all come here.
+
+        Raises:
+            UserInputError: always.
+        """
+        raise UserInputError(
+            f"a {type(self).__name__} cannot be copied or pickled, since its simulation lives in PyBullet: "
+            "make another with the same arguments and seed; to a worker process, pass the function that makes it"
+        )
+
+
+class Client(OfOneProcess):
+    """One connection to PyBullet, with a world of its own.
+
+    It disconnects when it is closed or no longer referred to. A forked child has a copy of the world; it leaves the
+    connection to the process that made it.
+
+    Args:
+        mode: ``pybullet.DIRECT``, or ``pybullet.GUI`` for a window.
+
+    Attributes:
+        number: what PyBullet calls it; -1 if it could not connect.
+    """
+
+    def __init__(self, mode: int) -> None:
+        try:
+            self.number: int = pybullet.connect(mode)
+        except pybullet.error:
+            self.number = -1
+        if self.number >= 0:
+            self._release = weakref.finalize(self, _disconnect, self.number, os.getpid())
+            self._release.atexit = False  # the process's end frees all of them
+
+    def close(self) -> None:
+        """Disconnect; harmless when done before."""
+        if self.number >= 0:
+            self._release()
+            self.number = -1
+
+
+def _disconnect(number: int, process: int) -> None:
+    if os.getpid() == process:
+        pybullet.disconnect(physicsClientId=number)

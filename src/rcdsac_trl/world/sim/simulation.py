@@ -18,20 +18,28 @@ from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.world.maps.generator import Map
-from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
+from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M, segment_clearance
 from rcdsac_trl.world.sim import bodies
-from rcdsac_trl.world.sim.bullet import pybullet
+from rcdsac_trl.world.sim.bullet import Client, pybullet
 from rcdsac_trl.world.sim.lidar import scan
 from rcdsac_trl.world.sim.movers import Movers, WalkPlanner
 
 SIMULATION_BYTES = 28_000_000
 """Memory that PyBullet takes for a simulation, however empty; where there is none left, it ends the process."""
 CONTACT_DISTANCE_M = 1e-3
-"""The robot is in contact with what is nearer than this.
+"""A contact begins with something nearer to the robot's body than this.
 
 The solver lets a pushing robot rest within about 0.01 mm of a wall, on either side of it; with a limit of 0
 mm, leaning on a wall would read as a series of collisions.
 """
+CONTACT_END_GAP_M = 0.005
+"""A contact can only end while nothing is within this gap of the circle around the robot's corners.
+
+Of the circle, not of the body: a robot that turns beside a wall touches it with one corner after the other, between
+which its flat sides are up to 19 mm away. The circle does not turn.
+"""
+CONTACT_END_S = 0.4
+"""A contact ends when the gap has been that wide at the end of every agent step for so long."""
 
 # Movers farther than this from touching the robot are moved in PyBullet only once an agent step, in which
 # both together go at most 0.2 m.
@@ -48,7 +56,8 @@ class StepResult(NamedTuple):
         pose: x, y in m and yaw in [-pi, pi] rad, map frame.
         v_c: linear velocity along the robot's x axis, measured after contact, m/s.
         omega_c: angular velocity, measured after contact, rad/s.
-        in_contact: whether the robot touched anything in any of the motor steps.
+        in_contact: whether the robot touched anything in any of the motor steps, or has not been clear of everything
+            for long enough since it did: see :data:`CONTACT_END_GAP_M` and :data:`CONTACT_END_S`.
     """
 
     pose: tuple[float, float, float]
@@ -58,7 +67,7 @@ class StepResult(NamedTuple):
 
 
 class Simulation:
-    """One robot in one PyBullet client.
+    """One robot in one PyBullet client, which is freed with it or when it is closed.
 
     Equal loads and steps give bit-identical results, whatever the client simulated before.
 
@@ -82,10 +91,8 @@ class Simulation:
 
     def __init__(self, gui: bool = False) -> None:
         self._gui = gui
-        try:
-            self._client = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        except pybullet.error:
-            self._client = -1
+        self._connection = Client(pybullet.GUI if gui else pybullet.DIRECT)
+        self._client = self._connection.number
         if self._client < 0 and not gui:
             raise UserInputError("PyBullet opens no more simulations in one process: use fewer agents or more workers")
         if self._client < 0:
@@ -93,6 +100,8 @@ class Simulation:
         self._pose = (0.0, 0.0, 0.0)
         self._v_c = self._omega_c = 0.0
         self._clearance_m = 0.0
+        self._in_contact = False
+        self._apart_steps = 0  # motor steps without anything near, since the last touch
 
     def load(
         self,
@@ -126,12 +135,13 @@ class Simulation:
         x, y, yaw = start_pose
         self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
         self._v_c = self._omega_c = self._clearance_m = 0.0
+        self._in_contact = False
         movers = self._movers = Movers(map, planner, start_pose[:2], movers_rng, MOTOR_PERIOD_S)
         self._mover_bodies = list(
             zip(bodies.add_movers(client, movers.discs, visual), movers.radii.tolist(), strict=True)
         )
         self._segments = np.ascontiguousarray(map.segments(), dtype=np.float64)
-        static = np.asarray(map.circles(), dtype=np.float64).reshape(-1, 3)
+        self._boxes, static = map.solids()
         # The last rows are the movers' own, so that they are sensed where they walk.
         self._circles = np.concatenate([static, movers.discs])
         movers.discs = self._circles[len(static) :]
@@ -175,7 +185,7 @@ class Simulation:
         if unnoticed:
             movers.step(x, y, motor_steps - 1)
         # Contacts that cannot be are not asked for, nor the velocities that only contact would change.
-        in_contact = False
+        touched = False
         touchable = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
         self._clearance_m = 0.0  # not known until the next scan
         for motor_step in range(motor_steps):
@@ -195,14 +205,26 @@ class Simulation:
             cos, sin = math.cos(yaw), math.sin(yaw)
             v_c = linear[0] * cos + linear[1] * sin
             omega_c = angular[2]
-            if touchable and not in_contact:
+            if touchable and not touched:
                 points = pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
-                in_contact = any(point[8] <= CONTACT_DISTANCE_M for point in points)
+                touched = any(point[8] <= CONTACT_DISTANCE_M for point in points)
             if self._gui:
                 time.sleep(MOTOR_PERIOD_S)
         self._pose = (x, y, math.remainder(yaw, 2.0 * math.pi))
         self._v_c, self._omega_c = v_c, omega_c
-        return StepResult(self._pose, v_c, omega_c, in_contact)
+        self._follow_contact(touched, motor_steps)
+        return StepResult(self._pose, v_c, omega_c, self._in_contact)
+
+    def _follow_contact(self, touched: bool, motor_steps: int) -> None:
+        """Let a contact begin with a touch, and end when nothing has been near for long enough."""
+        if touched:
+            self._in_contact, self._apart_steps = True, 0
+        elif self._in_contact:
+            x, y, _ = self._pose
+            wide_m = ROBOT_RADIUS_M + CONTACT_END_GAP_M
+            apart = segment_clearance(x, y, x, y, self._boxes, self._circles, wide_m) >= wide_m
+            self._apart_steps = self._apart_steps + motor_steps if apart else 0
+            self._in_contact = self._apart_steps * MOTOR_PERIOD_S < CONTACT_END_S
 
     def scan(self) -> NDArray[np.float64]:
         """Return the exact smallest distance from the robot's centre in each 2-degree sector.
@@ -217,9 +239,8 @@ class Simulation:
 
     def close(self) -> None:
         """Disconnect from PyBullet; harmless when done before."""
-        if self._client >= 0:
-            pybullet.disconnect(physicsClientId=self._client)
-            self._client = -1
+        self._connection.close()
+        self._client = -1
 
     def _sync_movers(self, robot_x: float, robot_y: float, everywhere: bool) -> None:
         """Tell PyBullet where the movers are: all of them, or only those that the robot could touch."""

@@ -15,6 +15,7 @@ from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world.maps.generator import SPLITS, MapSettings, Split
 from rcdsac_trl.world.render import Scene
+from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task import rules
 from rcdsac_trl.world.task.episode import NavigationAgent
 from rcdsac_trl.world.task.rules import TaskSettings
@@ -28,8 +29,10 @@ _COLUMNS = {key: slice(*edges) for key, edges in zip(_GATHERED, pairwise(_EDGES)
 _ACTION_TOLERANCE = 1e-6
 
 
-class AgentGroup:
+class AgentGroup(OfOneProcess):
     """The agents that one environment holds, each in its own simulation and with its own episode counter.
+
+    It can be neither copied nor pickled: its simulations live in PyBullet.
 
     Args:
         map_settings: how maps are generated.
@@ -85,6 +88,15 @@ class AgentGroup:
     def __len__(self) -> int:
         """Return the number of agents."""
         return len(self._agents)
+
+    @property
+    def seed(self) -> int:
+        """The root seed."""
+        return self._seed
+
+    def episode(self, row: int) -> int:
+        """Return the number of the episode that an agent has begun last."""
+        return self._next_episodes[row] - 1
 
     def set_seed(self, seed: int) -> None:
         """Set the root seed; the next reset of each agent begins its first episode."""

@@ -15,6 +15,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.processes import START_METHOD, resolve_num_workers
 from rcdsac_trl.world.maps.generator import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
+from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task.agent_group import AgentGroup
 from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, Space
@@ -24,7 +25,7 @@ COLLISION_WEIGHT = "collision_weight"
 _SHUTDOWN_S = 5.0
 
 
-class NavigationEnv(EnvBase):
+class NavigationEnv(OfOneProcess, EnvBase):
     """Several agents, each in its own simulation of the same map, stepped as one batch.
 
     Agents neither see nor touch each other. Agent ``i`` spends its episode ``k`` on map ``k`` of the split; a
@@ -38,6 +39,8 @@ class NavigationEnv(EnvBase):
     Reward: the paper's (section Reward), from ``reward_components``.
 
     Finish condition: none, ``terminated`` is never true; add ``StepCounter(max_steps=task.episode_steps)``.
+
+    It can be neither copied nor pickled: its simulations live in PyBullet. They are freed by :meth:`close`, or with it.
 
     Args:
         map_settings: how maps are generated.
@@ -89,7 +92,7 @@ class NavigationEnv(EnvBase):
         # The arrays that the agents write into, as tensors; what is never true is among them.
         self._written = {key: torch.from_numpy(array) for key, array in self.agents.buffers.items()}
         for key in ("done", "terminated"):
-            self._written[key] = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+            self._written[key] = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         self._renderer: Renderer | None = None
         self._make_specs()
 
@@ -98,12 +101,13 @@ class NavigationEnv(EnvBase):
         specs = {key: _torch_spec(space, batch) for key, space in SPACES.items()}
         reward = specs.pop("reward")
         if self._weighted:
-            specs[COLLISION_WEIGHT] = Unbounded(shape=(*batch, 1), dtype=torch.float32)
+            specs[COLLISION_WEIGHT] = Unbounded(shape=(*batch, 1), dtype=torch.float32, device=self.device)
             self.state_spec = Composite({COLLISION_WEIGHT: specs[COLLISION_WEIGHT].clone()}, shape=batch)
         self.observation_spec = Composite(specs, shape=batch)
         self.reward_spec = Composite({"reward": reward}, shape=batch)
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, ACTION_SIZE), dtype=torch.float32)
-        done = {key: Binary(1, shape=(*batch, 1), dtype=torch.bool) for key in ("done", "terminated")}
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, ACTION_SIZE), dtype=torch.float32, device=self.device)
+        flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=self.device)
+        done = {key: flag.clone() for key in ("done", "terminated")}
         self.done_spec = Composite(done, shape=batch)
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
@@ -133,7 +137,9 @@ class NavigationEnv(EnvBase):
         del out["reward"]
         if self._weighted:
             weight = None if tensordict is None else tensordict.get(COLLISION_WEIGHT, None)
-            out[COLLISION_WEIGHT] = torch.ones(*self.batch_size, 1) if weight is None else weight.clone()
+            out[COLLISION_WEIGHT] = (
+                self._written["reward"].new_ones(*self.batch_size, 1) if weight is None else weight.clone()
+            )
         return self._packed(out)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -186,11 +192,11 @@ class NavigationEnv(EnvBase):
 def _torch_spec(space: Space, batch: torch.Size) -> TensorSpec:
     shape = torch.Size([*batch, space.size])
     if space.dtype is np.bool_:
-        return Binary(space.size, shape=shape, dtype=torch.bool)
+        return Binary(space.size, shape=shape, dtype=torch.bool, device="cpu")
     if not space.bounded:
-        return Unbounded(shape=shape, dtype=torch.float32)
+        return Unbounded(shape=shape, dtype=torch.float32, device="cpu")
     low, high = (torch.from_numpy(limit).expand(shape).clone() for limit in (space.low, space.high))
-    return Bounded(low, high, shape=shape, dtype=torch.float32)
+    return Bounded(low, high, shape=shape, dtype=torch.float32, device="cpu")
 
 
 def make_env(

@@ -69,7 +69,8 @@ class NavigationAgent:
     Attributes:
         pose: x, y in m and yaw in rad, map frame.
         velocities: measured linear and angular velocity, then the desired ones, m/s and rad/s: o_velocity.
-        in_contact: whether the robot touched anything in the last step.
+        in_contact: whether the robot was in contact in the last step; see
+            :class:`~rcdsac_trl.world.sim.simulation.StepResult`.
         goal_reached: whether it reached its goal in the last step.
         reward_components: of the last step, see :func:`~rcdsac_trl.world.task.rules.reward_components`; zeros after
             a reset.
@@ -191,10 +192,18 @@ class NavigationAgent:
         self._take_waypoints()
 
     def _take_waypoints(self) -> None:
-        """Pass every corner point within reach; the goal itself stays until it is reached."""
-        last = len(self._path) - 1
-        while self._next < last and self._distance_to(self._path[self._next]) < self._task.waypoint_radius_m:
+        """Pass every corner point that is near enough; the goal itself stays until it is reached."""
+        while self._next < len(self._path) - 1 and self._is_passed(self._next):
             self._next += 1
+
+    def _is_passed(self, number: int) -> bool:
+        """Say whether a waypoint is within reach and the one after it can be driven to from here."""
+        distance_m = self._distance_to(self._path[number])
+        if distance_m >= self._task.waypoint_radius_m:
+            return False
+        return distance_m < rules.SURE_WAYPOINT_RADIUS_M or self._planner.leg_is_free(
+            self.pose[:2], self._path[number + 1]
+        )
 
     def _distance_to(self, point: Point) -> float:
         return math.hypot(point[0] - self.pose[0], point[1] - self.pose[1])

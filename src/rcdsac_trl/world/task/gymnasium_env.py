@@ -8,39 +8,43 @@ import numpy as np
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.maps.generator import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
+from rcdsac_trl.world.sim.bullet import OfOneProcess
+from rcdsac_trl.world.task import gymnasium_id
 from rcdsac_trl.world.task.agent_group import AgentGroup
 from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, AGENT_OBSERVATIONS, SPACES
 
-ENV_ID = "RCDSACNavigation-v0"
 FRAMES_PER_S = 7  # a control period is 0.14 s on average
 
 
-class NavigationGymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """One agent of :class:`~rcdsac_trl.world.task.env.NavigationEnv`, with the same episodes and numbers.
 
     Observations: a dict of ``range`` [180], ``waypoint`` [6] and ``velocity`` [4], float32.
 
-    Info: ``pose`` [3] (x, y in m, yaw in rad), ``contact``, ``goal_reached`` and ``reward_components`` [5].
+    Info: ``pose`` [3] (x, y in m, yaw in rad), ``contact``, ``goal_reached``, ``reward_components`` [5], and the
+    ``seed`` and ``episode`` that map, start, goals and movers derive from.
 
     Finish condition: ``truncated`` after ``task.episode_steps`` steps; never ``terminated``.
 
     ``reset(seed=s)`` sets the root seed and begins at the first episode; ``reset()`` begins the next one, and
-    ``reset(options={"episode": k})`` that one.
+    ``reset(options={"episode": k})`` that one. Where no seed was ever given, the first reset draws one.
+
+    It can be neither copied nor pickled: its simulation lives in PyBullet. It is freed by :meth:`close`, or with it.
 
     Args:
         map_settings: how maps are generated.
         task: rules of the task.
         sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
         split: which of the disjoint map sets.
-        seed: root seed until a reset brings another.
+        seed: root seed until a reset brings another; None: the first reset draws one.
         agent_id: the agent's global number.
         first_episode: number of the first episode.
         gui: show PyBullet's window.
         render_mode: ``"rgb_array"`` or None.
 
     Example:
-        >>> env = gymnasium.make("rcdsac_trl.world.task.gymnasium_env:RCDSACNavigation-v0", sensor="full")
+        >>> env = gymnasium.make("rcdsac_trl:RCDSACNavigation-v0", sensor="full")
         >>> observation, info = env.reset(seed=0)
         >>> observation["range"].shape
         (180,)
@@ -55,7 +59,7 @@ class NavigationGymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         *,
         sensor: str = "narrow",
         split: Split = "train",
-        seed: int = 0,
+        seed: int | None = None,
         agent_id: int = 0,
         first_episode: int = 0,
         gui: bool = False,
@@ -73,11 +77,13 @@ class NavigationGymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             task,
             sensor=sensor,
             split=split,
-            seed=seed,
+            seed=0 if seed is None else seed,
             agent_ids=(agent_id,),
             first_episode=first_episode,
             gui=gui,
         )
+        self._seed = seed
+        self._has_begun = False
         self._steps = 0
         self._renderer = Renderer() if render_mode == "rgb_array" else None
 
@@ -85,9 +91,14 @@ class NavigationGymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""
-        super().reset(seed=seed)
-        if seed is not None:
-            self._agents.set_seed(seed)
+        root = seed
+        if root is None and not self._has_begun:
+            root = self._drawn_seed() if self._seed is None else self._seed
+        # Without a seed, a generator that is there already stays as it is.
+        super().reset(seed=root if self._np_random is None else seed)
+        if root is not None:
+            self._agents.set_seed(root)
+        self._has_begun = True
         self._agents.reset((0,), (options or {}).get("episode"))
         self._steps = 0
         return self._observation(), self._info()
@@ -108,6 +119,12 @@ class NavigationGymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """Disconnect the simulation."""
         self._agents.close()
 
+    def _drawn_seed(self) -> int:
+        """Draw a seed of 31 bits, from the generator that a user may have brought, else from entropy."""
+        if self._np_random is not None:
+            return int(self._np_random.integers(2**31))
+        return int(np.random.SeedSequence().generate_state(1)[0]) >> 1
+
     def _observation(self) -> dict[str, np.ndarray]:
         return {key: getattr(self._agents.buffers, key)[0].copy() for key in AGENT_OBSERVATIONS}
 
@@ -118,6 +135,8 @@ class NavigationGymEnv(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
             "contact": bool(buffers.contact[0, 0]),
             "goal_reached": bool(buffers.goal_reached[0, 0]),
             "reward_components": buffers.reward_components[0].copy(),
+            "seed": self._agents.seed,
+            "episode": self._agents.episode(0),
         }
 
 
@@ -126,10 +145,4 @@ def _box(key: str) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(space.low, space.high, dtype=np.float32)
 
 
-def register() -> None:
-    """Register :data:`ENV_ID` with Gymnasium; harmless when done before."""
-    if ENV_ID not in gymnasium.registry:
-        gymnasium.register(ENV_ID, entry_point=f"{__name__}:NavigationGymEnv")
-
-
-register()
+gymnasium_id.register()

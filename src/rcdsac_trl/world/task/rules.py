@@ -26,6 +26,15 @@ MIN_TURN_FACTOR = 0.5
 TURN_SCALE = math.radians(120.0)
 """The desired angular velocity at which 1 - |omega_u| / scale would reach 0, rad/s."""
 
+RULES_VERSION = 2
+"""Version of the rules: results of different versions do not compare.
+
+1: a contact ended as soon as nothing was within 1 mm, so that a robot turning beside a wall began one after the other;
+a waypoint gave way to the next wherever the robot was within its radius. 2: as described here.
+"""
+SURE_WAYPOINT_RADIUS_M = 0.15
+"""A waypoint nearer than this gives way to the next whatever is in the way, so that nobody circles one for ever."""
+
 CollisionPenaltyMode = Literal["onset", "per_step"]
 """When r_coll is paid: once as a contact begins, or in every agent step in contact."""
 
@@ -35,10 +44,12 @@ class TaskSettings:
     """What the task leaves to choose; every field is a key of ``conf/task/*.yaml``.
 
     Attributes:
+        version: version of the rules, :data:`RULES_VERSION`.
         episode_steps: agent steps in an episode.
         collision_penalty_mode: ``"onset"`` pays -10 once, as a contact begins; ``"per_step"`` in every agent
             step in contact.
-        waypoint_radius_m: a waypoint nearer than this gives way to the next.
+        waypoint_radius_m: a waypoint nearer than this gives way to the next once the straight way there is free of
+            what the planner knows, or the waypoint is nearer than :data:`SURE_WAYPOINT_RADIUS_M`.
         goal_radius_m: a goal nearer than this is reached.
         min_path_m: shortest path from where the robot is to a new goal.
         motor_steps: numbers of 0.02 s motor steps in an agent step; an episode draws one of them.
@@ -55,6 +66,7 @@ class TaskSettings:
         (6, 7, 8)
     """
 
+    version: int = RULES_VERSION
     episode_steps: int = 1000
     collision_penalty_mode: CollisionPenaltyMode = "onset"
     waypoint_radius_m: float = 0.5
@@ -74,6 +86,11 @@ class TaskSettings:
         # Hydra hands lists over; a frozen value keeps tuples.
         object.__setattr__(self, "motor_steps", tuple(self.motor_steps))
         object.__setattr__(self, "odometry_noise_std", tuple(self.odometry_noise_std))
+        if self.version != RULES_VERSION:
+            raise UserInputError(
+                f"task version is {self.version!r} but this is version {RULES_VERSION} of the rules; "
+                f"set version to {RULES_VERSION}"
+            )
         if self.episode_steps < 1:
             raise UserInputError(f"episode_steps={self.episode_steps} must be at least 1")
         modes = get_args(CollisionPenaltyMode)
@@ -113,7 +130,7 @@ def reward_components(
         v_c: linear velocity measured after the step, m/s.
         theta_1: bearing, after the step, of the waypoint that was next during the step, rad.
         omega_u: desired angular velocity after the dead band, rad/s.
-        in_contact: whether the robot touched anything during the step; r_waypoint is 0 then.
+        in_contact: whether the robot was in contact during the step; r_waypoint is 0 then.
         collided: whether r_coll is due; see :func:`collision_due`.
         goal_reached: whether the goal was reached in this step.
 
@@ -158,7 +175,8 @@ def collision_due(in_contact: bool, was_in_contact: bool, mode: CollisionPenalty
     """Return whether r_coll is paid in this agent step.
 
     Args:
-        in_contact: contact in any motor step of this agent step.
+        in_contact: whether the robot was in contact in this agent step, see
+            :class:`rcdsac_trl.world.sim.simulation.StepResult`.
         was_in_contact: the same of the agent step before; False in an episode's first.
         mode: ``"onset"`` pays the first step of a contact, ``"per_step"`` each.
 
