@@ -59,12 +59,12 @@ def range_by_kernels(module: RangeFeatures, bins: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("number", [FEW_OBSERVATIONS, BLOCK, 2 * BLOCK + 3])
-@pytest.mark.parametrize("heard", [list(range(180)), NARROW, [90], list(range(9, 180, 10)), []])
+@pytest.mark.parametrize("active", [list(range(180)), NARROW, [90], list(range(9, 180, 10)), []])
 @pytest.mark.parametrize("padding", ["circular", "none"])
-def test_range_features_equal_the_layers(number: int, heard: list[int], padding: Padding) -> None:
+def test_range_features_equal_the_layers(number: int, active: list[int], padding: Padding) -> None:
     module = RangeFeatures(6, 16, padding).double()
     bins = torch.zeros(number, 180, dtype=torch.float64)
-    bins[:, heard] = torch.rand(number, len(heard), dtype=torch.float64)
+    bins[:, active] = torch.rand(number, len(active), dtype=torch.float64)
     fast, plain = range_by_kernels(module, bins), module(bins)
     torch.testing.assert_close(fast, plain)
     parameters = list(module.parameters())
@@ -73,15 +73,15 @@ def test_range_features_equal_the_layers(number: int, heard: list[int], padding:
         torch.testing.assert_close(range_by_kernels(module, bins), plain)
 
 
-def test_silent_bins_are_left_out() -> None:
+def test_inactive_bins_are_left_out() -> None:
     bins = np.zeros((3, 180), np.float32)
-    assert feature_kernels.heard_positions(bins + 1.0, 5).tolist() == list(range(43))
+    assert feature_kernels.active_positions(bins + 1.0, 5).tolist() == list(range(43))
     # Bins 0..20 reach positions 0..10 of the first convolution and 0..5 of the second; 158..179 reach 77..87, 38..42.
     bins[1, NARROW] = 1.0
-    assert feature_kernels.heard_positions(bins, 5).tolist() == [*range(6), *range(38, 43)]
+    assert feature_kernels.active_positions(bins, 5).tolist() == [*range(6), *range(38, 43)]
     # Bin 0 reaches position 0, bin 14 reaches 2 and 3.
-    assert feature_kernels.heard_positions(np.eye(180, dtype=np.float32)[[0, 14]], 5).tolist() == [0, 2, 3]
-    assert feature_kernels.heard_positions(0.0 * bins, 5).tolist() == [0]
+    assert feature_kernels.active_positions(np.eye(180, dtype=np.float32)[[0, 14]], 5).tolist() == [0, 2, 3]
+    assert feature_kernels.active_positions(0.0 * bins, 5).tolist() == [0]
 
 
 @pytest.mark.parametrize(("rows", "steps"), [(1, 1), (1, 4), (3, 1), (5, 6)])

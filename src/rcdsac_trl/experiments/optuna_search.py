@@ -4,11 +4,6 @@ Hydra's own Optuna sweeper wants an Optuna that is years old, and knows nothing 
 Optuna is asked and told; a trial is a job as a sweep has them, and its validation table is read while it trains, so
 that it can be pruned. Everything Optuna knows is in its storage: a search that was killed goes on with the trials that
 were lost, from their checkpoints, and several processes may search together.
-
-Public names::
-
-    Number, Choice      what is searched
-    Search              the search
 """
 
 import importlib.util

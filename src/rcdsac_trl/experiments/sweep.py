@@ -2,13 +2,6 @@
 
 A sweep is a folder with an index of its runs, ``sweep.json``, and one run folder for each. How a run stands is written
 in the run's own folder (``state.json``), by whoever runs it, on whichever machine: nothing is said in two places.
-
-Public names::
-
-    Job, State      a run of a sweep, and how it stands
-    Sweep           runs jobs through a launcher
-    execute         runs one job where it is called
-    runs_of         what a sweep folder holds, for those who read results
 """
 
 import json

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from rcdsac_trl.agent.kernels.feature_kernels import linear
-from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.agent.kernels.matmul import empty_aligned, matmul, matmul_nt, matmul_tn
 
 #: Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
 ROWS_PER_BLOCK = 1024
@@ -133,14 +133,14 @@ def input_gradient(x: np.ndarray, weight: np.ndarray, d_x: np.ndarray, d_joined:
         row, d_row = rows[r], d_rows[r]
         for h in range(row.size):
             d_row[h] = d_row[h] if row[h] > zero else zero
-    times(d_rows, weight, _rows(d_joined), False)
+    matmul(d_rows, weight, _rows(d_joined), False)
 
 
 @_compiled
 def affine_gradient(d_out: np.ndarray, given: np.ndarray, d_weight: np.ndarray, d_bias: np.ndarray) -> None:
     """Write the gradients of a linear layer's weight and bias."""
     d_rows = _rows(d_out)
-    transposed_times(d_rows, _rows(given), d_weight, False)
+    matmul_tn(d_rows, _rows(given), d_weight, False)
     add_up(d_rows, d_bias)
 
 
@@ -160,7 +160,7 @@ def offsets(cosines: np.ndarray, weight: np.ndarray, bias: np.ndarray, beta: np.
     rows = _rows(beta)
     for r in range(rows.shape[0]):
         rows[r] = bias
-    times_transposed(_rows(cosines), weight, rows, True)
+    matmul_nt(_rows(cosines), weight, rows, True)
 
 
 @_compiled
@@ -179,15 +179,15 @@ def layers(
 ) -> None:
     """Write the gates, the hidden layer and the values; hidden may have room for some sequences alone."""
     sequences, steps, number = values.shape
-    times_transposed(_rows(cosines), gate_weight, _rows(tau_gate), False)
+    matmul_nt(_rows(cosines), gate_weight, _rows(tau_gate), False)
     size = block(steps * number, sequences)
-    product = room((size, steps, number, x.shape[2]), x)
+    product = empty_aligned((size, steps, number, x.shape[2]), x)
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         first = start if hidden.shape[0] >= sequences else 0
         inner, factors = _rows(hidden[first : first + stop - start]), product[: stop - start]
         _multiply(x[start:stop], tau_gate[start:stop], beta[start:stop], factors)
-        times_transposed(_rows(factors), weight, inner, False)
+        matmul_nt(_rows(factors), weight, inner, False)
         _output(inner, bias, out_weight, out_bias, values[start:stop].reshape(-1))
 
 
@@ -210,14 +210,14 @@ def layers_gradient(
     """Add the gradients of all layers; those of weight and bias lack the output's weight, a factor of each row."""
     sequences, steps, number = slopes.shape
     size = block(steps * number, sequences)
-    product, d_hidden = room((size, steps, number, x.shape[2]), x), room((size, *hidden.shape[1:]), x)
-    d_tau_gate = room(tau_gate.shape, x)
+    product, d_hidden = empty_aligned((size, steps, number, x.shape[2]), x), empty_aligned((size, *hidden.shape[1:]), x)
+    d_tau_gate = empty_aligned(tau_gate.shape, x)
     d_tau_gate[:] = 0
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         factors, d_inner = product[: stop - start], _rows(d_hidden[: stop - start])
         _output_gradient(slopes[start:stop].reshape(-1), _rows(hidden[start:stop]), d_inner, d_bias, d_out_weight)
-        times(d_inner, through, _rows(factors), False)
+        matmul(d_inner, through, _rows(factors), False)
         _product_gradient(
             factors,
             x[start:stop],
@@ -227,8 +227,8 @@ def layers_gradient(
             d_tau_gate[start:stop],
             d_beta[start:stop],
         )
-        transposed_times(d_inner, _rows(factors), d_weight, True)
-    transposed_times(_rows(d_tau_gate), _rows(cosines), d_gate_weight, True)
+        matmul_tn(d_inner, _rows(factors), d_weight, True)
+    matmul_tn(_rows(d_tau_gate), _rows(cosines), d_gate_weight, True)
 
 
 @_compiled
@@ -243,12 +243,12 @@ def gradient_of_features(
     """Add the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
     sequences, steps, number = slopes.shape
     size = block(steps * number, sequences)
-    d_hidden = room((size * steps, number, hidden.shape[3]), d_x)
-    d_product = room((size * steps, number, d_x.shape[2]), d_x)
+    d_hidden = empty_aligned((size * steps, number, hidden.shape[3]), d_x)
+    d_product = empty_aligned((size * steps, number, d_x.shape[2]), d_x)
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         sloping = _sloping_gradient(slopes[start:stop], hidden[start:stop], d_hidden)
-        times(_rows(d_hidden[:sloping]), through, _rows(d_product[:sloping]), False)
+        matmul(_rows(d_hidden[:sloping]), through, _rows(d_product[:sloping]), False)
         _features_gradient(slopes[start:stop], d_product, tau_gate[start:stop], beta[start:stop], d_x[start:stop])
 
 

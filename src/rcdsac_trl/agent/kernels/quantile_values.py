@@ -4,12 +4,6 @@ It computes exactly what ordinary layers do (tests hold it against those, and ag
 of 6,400 transitions has 100,000 quantiles: as ordinary layers, every gate, product and activation of theirs is 50
 MB that goes to main memory and back between two operations. Of a batch of 256, calling the layers takes as long as
 what they compute. Here few compiled passes do it all, in blocks that stay in the cache.
-
-Public names::
-
-    HeadLayers(input, gate_tau, gate_beta | None, hidden, output)       the layers, a named tuple
-    quantile_values(memory [B,L,M], action [B,L,A], tau [B,L|1,N], beta [B,L|1,C] | None, frequencies [C], layers)
-        -> [B,L,N]
 """
 
 from typing import Any, NamedTuple

@@ -4,10 +4,6 @@ It computes exactly what ``nn.GRU`` does (tests hold it against that, and agains
 records some twenty operations a step for its backward pass, among them a matrix product for every weight. Here all
 steps, forth or back, are one compiled pass, with one matrix product a step; whatever does not wait for another step is
 one product over all of them.
-
-Public names::
-
-    gated_recurrence(inputs [T,B,I], gru) -> [T,B,H]
 """
 
 from collections.abc import Callable
@@ -20,7 +16,7 @@ from numba.extending import overload
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.agent.kernels.matmul import empty_aligned, matmul, matmul_nt, matmul_tn
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 
@@ -117,10 +113,10 @@ def _steps(
 ) -> None:
     """Do all steps from the state 0."""
     states[0], recurrent[0] = 0, 0
-    times_transposed(x, w_in, gates.reshape(x.shape[0], -1), False)
+    matmul_nt(x, w_in, gates.reshape(x.shape[0], -1), False)
     for t in range(gates.shape[0]):
         if t > 0:
-            times_transposed(states[t], w_re, recurrent[t], False)
+            matmul_nt(states[t], w_re, recurrent[t], False)
         _step(gates[t], recurrent[t], b_in, b_re, states[t], states[t + 1])
 
 
@@ -140,17 +136,21 @@ def _steps_gradient(
     d_b_re: np.ndarray,
 ) -> None:
     """Write the gradients of the inputs and of the weights."""
-    d_inputs, d_recurrent, carried = room(gates.shape, x), room(gates.shape, x), room(states.shape[1:], x)
+    d_inputs, d_recurrent, carried = (
+        empty_aligned(gates.shape, x),
+        empty_aligned(gates.shape, x),
+        empty_aligned(states.shape[1:], x),
+    )
     carried[:] = 0
     for t in range(len(gates) - 1, -1, -1):
         _step_gradient(gradient[t], carried, gates[t], recurrent[t], states[t], d_inputs[t], d_recurrent[t])
         if t > 0:
-            times(d_recurrent[t], w_re, carried, True)
+            matmul(d_recurrent[t], w_re, carried, True)
     rows, first, size = x.shape[0], states.shape[1], states.shape[2]
     of_inputs, of_states = d_inputs.reshape(rows, -1), d_recurrent.reshape(rows, -1)
-    times(of_inputs, w_in, d_x, False)
-    transposed_times(of_inputs, x, d_w_in, False)
-    transposed_times(of_states[first:], states[1:-1].reshape(rows - first, size), d_w_re, False)
+    matmul(of_inputs, w_in, d_x, False)
+    matmul_tn(of_inputs, x, d_w_in, False)
+    matmul_tn(of_states[first:], states[1:-1].reshape(rows - first, size), d_w_re, False)
     d_b_in[:], d_b_re[:] = 0, 0
     for r in range(rows):
         row, other = of_inputs[r], of_states[r]

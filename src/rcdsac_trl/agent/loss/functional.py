@@ -1,12 +1,4 @@
-"""The pure functions of the loss.
-
-Public names::
-
-    quantile_huber_loss(quantiles [..,N], targets [..,N'], tau [..,N], kappa=1) -> [..]
-    squash(loc, scale, noise) -> action, log_prob
-    call_module(module, entries) -> what it writes, by its keys' order
-    minimum(values), mean(values) -> element-wise; smaller(values) -> of each entry, all of the critic with smaller mean
-"""
+"""The pure functions of the loss."""
 
 import math
 

@@ -3,15 +3,6 @@ r"""Controllers that turn beta while an agent drives: bolder where there is room
 Each is called once in every control period, *before* :meth:`rcdsac_trl.deploy.Policy.act`, with what the sensor says
 now and the quantiles of the command before, and returns the beta to drive with. A smaller beta is more averse, so
 ``low`` is the most careful one that a controller uses, and ``high`` the boldest.
-
-Public names::
-
-    BetaController                                      reset(), (distances_m, quantiles) -> beta
-    FixedBeta(beta)
-    ClearanceBeta(low, high, near_m=0.4, far_m=1.2, sensor="full")
-    TailVarianceBeta(low, high, window_steps=200)
-    BanditBeta(betas, rng, step_size=0.05, exploration=0.1)     .learn(episode_return)
-    lower_tail_variance(quantiles) -> float
 """
 
 from collections.abc import Sequence
