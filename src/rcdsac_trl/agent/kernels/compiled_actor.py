@@ -105,18 +105,9 @@ def _recurrence(features: Floats, state: Floats, weights: "Weights") -> None:
 
 
 @_compiled
-def _act(
-    ranges: Floats,
-    vectors: Floats,
-    embedded: Floats,
-    states: Floats,
-    noise: Floats,
-    weights: "Weights",
-    loc: Floats,
-    scale: Floats,
-    action: Floats,
-) -> None:
-    """Do a step of every agent: advance ``states`` in place and write loc, scale and action."""
+def _act(agents: "Agents", weights: "Weights") -> None:
+    """Do a step of every agent."""
+    ranges, vectors, embedded, states, noise, loc, scale, action = agents
     num_range = weights.linear_bias.size
     features = np.empty(num_range + weights.vectors_bias.size, np.float32)
     size = weights.head_bias.size
@@ -142,6 +133,19 @@ def _act(
             scale[agent, a] = np.exp(min(max(out[loc.shape[1] + a], _LOG_STD_LOW), _LOG_STD_HIGH))
             drawn = np.tanh(loc[agent, a] + noise[agent, a] * scale[agent, a])
             action[agent, a] = min(max(drawn, -_LARGEST_ACTION), _LARGEST_ACTION)
+
+
+class Agents(NamedTuple):
+    """A step of some agents: what :func:`_act` reads of each, and what it writes."""
+
+    ranges: Floats  # padded, [N, bins]
+    vectors: Floats  # one behind the other, [N, k]
+    embedded: Floats  # beta, [N]
+    states: Floats  # advanced in place, [N, memory]
+    noise: Floats  # [N, action]
+    loc: Floats  # written, [N, action], as the other two
+    scale: Floats
+    action: Floats
 
 
 class Weights(NamedTuple):
@@ -265,17 +269,15 @@ class CompiledActor:
         following = torch.where(is_init, 0.0, state)
         size = self._head.output.out_features // 2
         loc, scale, action = torch.empty(3, number, size).unbind()
-        _act(
-            self._encoder.range.padded(range_).contiguous().numpy(),
-            torch.cat(list(vectors), dim=-1).numpy(),
-            embedded.view(-1).numpy(),
-            following.numpy(),
-            (torch.zeros(number, size) if noise is None else noise).numpy(),
-            self._current(bool(is_init.any())),
-            loc.numpy(),
-            scale.numpy(),
-            action.numpy(),
+        tensors = (
+            self._encoder.range.padded(range_).contiguous(),
+            torch.cat(list(vectors), dim=-1),
+            embedded.view(-1),
+            following,
+            torch.zeros(number, size) if noise is None else noise,
+            *(loc, scale, action),
         )
+        _act(Agents(*(value.numpy() for value in tensors)), self._current(bool(is_init.any())))
         return loc, scale, action, following
 
     def _current(self, begins: bool) -> Weights:

@@ -1,9 +1,10 @@
 """The compiled passes of :mod:`rcdsac_trl.agent.kernels.observation_features`, on arrays.
 
 A batch goes through the range observation's layers, matrix products included, in blocks that stay in the cache. Bins
-that are inactive in the whole batch, such as those a narrow sensor lacks, are left out. ``convolutions`` are weight and
-bias of the first and of the second.
+that are inactive in the whole batch, such as those a narrow sensor lacks, are left out.
 """
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -16,6 +17,26 @@ ROWS_PER_BLOCK = 96 * 43
 _SEEN = 3
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+
+
+class RangeLayers(NamedTuple):
+    """Weights and biases of the layers, or their gradients."""
+
+    conv_1: np.ndarray  # [channels, 1, taps]
+    conv_1_bias: np.ndarray
+    conv_2: np.ndarray  # [channels, channels, taps]
+    conv_2_bias: np.ndarray
+    linear: np.ndarray  # [features, position, channel]
+    linear_bias: np.ndarray
+
+
+class RangeActivations(NamedTuple):
+    """What the layers write on their way forth and read on their way back."""
+
+    positions: np.ndarray  # the active ones of the second convolution
+    active: np.ndarray  # the linear layer's weight at these, [features, position, channel]
+    inactive: np.ndarray  # its sum over the others, [features, channel]
+    outputs: np.ndarray  # of the second convolution, [observation and active position, channel]
 
 
 @_compiled
@@ -142,19 +163,10 @@ def _by_tap(w1: np.ndarray, w2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @_compiled
-def range_layers(
-    bins: np.ndarray,
-    positions: np.ndarray,
-    convolutions: tuple[np.ndarray, ...],
-    by_position: np.ndarray,
-    b3: np.ndarray,
-    active: np.ndarray,
-    inactive: np.ndarray,
-    activations: np.ndarray,
-    out: np.ndarray,
-) -> None:
+def range_layers(bins: np.ndarray, weights: RangeLayers, activations: RangeActivations, out: np.ndarray) -> None:
     """Write the features into out's first columns, and what the way back reads of active and inactive positions."""
-    w1, b1, w2, b2 = convolutions
+    w1, b1, w2, b2, by_position, b3 = weights
+    positions, active, inactive, outputs = activations
     number, features = positions.size, b3.size
     taps, kernel = _by_tap(w1, w2)
     _divide(by_position, positions, active, inactive)
@@ -164,7 +176,7 @@ def range_layers(
     windows = empty_aligned((size * number, kernel.shape[0]), bins)
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
-        window, rows = windows[: (stop - start) * number], activations[start * number : stop * number]
+        window, rows = windows[: (stop - start) * number], outputs[start * number : stop * number]
         _first_layer(bins[start:stop], positions, taps, b1, window)
         matmul(window, kernel, rows, False)
         _rectify(rows, 0, b2)
@@ -207,17 +219,17 @@ def where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> n
 def range_gradient(
     gradient: np.ndarray,
     bins: np.ndarray,
-    positions: np.ndarray,
-    convolutions: tuple[np.ndarray, ...],
-    active: np.ndarray,
-    inactive: np.ndarray,
-    activations: np.ndarray,
-    d_convolutions: tuple[np.ndarray, ...],
-    d_by_position: np.ndarray,
-    d_b3: np.ndarray,
+    weights: RangeLayers,
+    activations: RangeActivations,
+    gradients: RangeLayers,
 ) -> None:
-    """Write the gradients of all layers from that of the linear layer's output, ``gradient``; that of b3 is given."""
-    (w1, b1, w2, b2), (d_w1, d_b1, d_w2, d_b2) = convolutions, d_convolutions
+    """Write the gradients of all layers from that of the linear layer before its rectifier, ``[n, features ..]``.
+
+    That of the linear layer's bias is given.
+    """
+    w1, b1, w2, b2, _, _ = weights
+    positions, active, inactive, outputs = activations
+    d_w1, d_b1, d_w2, d_b2, d_by_position, d_b3 = gradients
     number, zero, channels = positions.size, bins.dtype.type(0), b1.size
     taps, kernel = _by_tap(w1, w2)
     d_taps, d_kernel, d_active = (
@@ -233,7 +245,7 @@ def range_gradient(
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
         window, d_window = windows[: (stop - start) * number], d_windows[: (stop - start) * number]
-        rows, d_rows = activations[start * number : stop * number], d_activations[: (stop - start) * number]
+        rows, d_rows = outputs[start * number : stop * number], d_activations[: (stop - start) * number]
         slopes = gradient[start:stop, : d_b3.size]
         matmul_tn(slopes, rows.reshape(stop - start, -1), _flat(d_active), True)
         matmul(slopes, _flat(active), d_rows.reshape(stop - start, -1), False)

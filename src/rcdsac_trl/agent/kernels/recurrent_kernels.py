@@ -6,8 +6,8 @@ steps, forth or back, are one compiled pass, with one matrix product a step; wha
 one product over all of them.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -24,6 +24,23 @@ _compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"c
 _LIMIT = np.float32(8.5)
 _P0, _P1, _P2, _P3, _P4 = (np.float32(c) for c in (1.0, 1.3413249e-1, 3.5340297e-3, 2.1251091e-5, 1.4269291526e-8))
 _Q0, _Q1, _Q2, _Q3, _Q4 = (np.float32(c) for c in (1.0, 4.6746573e-1, 2.6022762e-2, 3.348869404e-4, 8.1451497636e-7))
+
+
+class _Weights(NamedTuple):
+    """Weights and biases for what comes in and for what is remembered, or their gradients."""
+
+    w_in: np.ndarray
+    w_re: np.ndarray
+    b_in: np.ndarray
+    b_re: np.ndarray
+
+
+class _Activations(NamedTuple):
+    """What the steps write on their way forth and read on their way back."""
+
+    gates: np.ndarray  # r, z, n, [T, B, 3 H]
+    recurrent: np.ndarray  # what the state contributes to them, [T, B, 3 H]
+    states: np.ndarray  # from the first, 0, to the last, [T + 1, B, H]
 
 
 def _tanh(x: Any) -> Any:
@@ -101,17 +118,10 @@ def _step_gradient(
 
 
 @_compiled
-def _steps(
-    x: np.ndarray,
-    w_in: np.ndarray,
-    w_re: np.ndarray,
-    b_in: np.ndarray,
-    b_re: np.ndarray,
-    gates: np.ndarray,
-    recurrent: np.ndarray,
-    states: np.ndarray,
-) -> None:
+def _steps(x: np.ndarray, weights: _Weights, activations: _Activations) -> None:
     """Do all steps from the state 0."""
+    w_in, w_re, b_in, b_re = weights
+    gates, recurrent, states = activations
     states[0], recurrent[0] = 0, 0
     matmul_nt(x, w_in, gates.reshape(x.shape[0], -1), False)
     for t in range(gates.shape[0]):
@@ -124,18 +134,15 @@ def _steps(
 def _steps_gradient(
     gradient: np.ndarray,
     x: np.ndarray,
-    w_in: np.ndarray,
-    w_re: np.ndarray,
-    gates: np.ndarray,
-    recurrent: np.ndarray,
-    states: np.ndarray,
+    weights: _Weights,
+    activations: _Activations,
     d_x: np.ndarray,
-    d_w_in: np.ndarray,
-    d_w_re: np.ndarray,
-    d_b_in: np.ndarray,
-    d_b_re: np.ndarray,
+    gradients: _Weights,
 ) -> None:
     """Write the gradients of the inputs and of the weights."""
+    w_in, w_re, _, _ = weights
+    gates, recurrent, states = activations
+    d_w_in, d_w_re, d_b_in, d_b_re = gradients
     d_inputs, d_recurrent, carried = (
         empty_aligned(gates.shape, x),
         empty_aligned(gates.shape, x),
@@ -169,19 +176,27 @@ class _GatedRecurrence(torch.autograd.Function):
         gates = inputs.new_empty(steps, rows, 3 * size)  # r, z, n
         recurrent, states = torch.empty_like(gates), inputs.new_empty(steps + 1, rows, size)
         weights = w_in, w_re, b_in, b_re
-        _steps(*(value.numpy() for value in (x, *weights, gates, recurrent, states)))
-        ctx.save_for_backward(x, w_in, w_re, gates, recurrent, states)
+        _steps(x.numpy(), _weights(weights), _activations(gates, recurrent, states))
+        ctx.save_for_backward(x, *weights, gates, recurrent, states)
         return states[1:]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        x, w_in, w_re, gates, recurrent, states = ctx.saved_tensors
-        d_x, d_w_in, d_w_re = torch.empty_like(x), torch.empty_like(w_in), torch.empty_like(w_re)
-        d_b_in, d_b_re = w_in.new_empty(2, len(w_in))
-        known = gradient.contiguous(), x, w_in, w_re, gates, recurrent, states
-        _steps_gradient(*(value.numpy() for value in (*known, d_x, d_w_in, d_w_re, d_b_in, d_b_re)))
-        return d_x.view(*gates.shape[:2], -1), d_w_in, d_w_re, d_b_in, d_b_re
+        x, *weights, gates, recurrent, states = ctx.saved_tensors
+        d_x, gradients = torch.empty_like(x), [torch.empty_like(value) for value in weights]
+        activations = _activations(gates, recurrent, states)
+        slopes = gradient.contiguous().numpy()
+        _steps_gradient(slopes, x.numpy(), _weights(weights), activations, d_x.numpy(), _weights(gradients))
+        return d_x.view(*gates.shape[:2], -1), *gradients
+
+
+def _weights(tensors: Sequence[Tensor]) -> _Weights:
+    return _Weights(*(value.numpy() for value in tensors))
+
+
+def _activations(*tensors: Tensor) -> _Activations:
+    return _Activations(*(value.numpy() for value in tensors))
 
 
 def gated_recurrence(inputs: Tensor, gru: nn.GRU) -> Tensor:
