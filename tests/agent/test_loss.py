@@ -368,7 +368,7 @@ def test_no_bootstrap_beyond_termination() -> None:
     batch = make_batch(beta=-1.0)
     batch["next", "terminated"][:] = True
     loss = make_loss(num_target_quantiles=5)
-    target = loss.compute_target(batch, loss.encode_actor(batch), loss.draw(batch))
+    target = loss.compute_target(batch, loss.encode_actor(batch), loss.draw_samples(batch))
     torch.testing.assert_close(target, batch["next", "reward"][:, :-1].expand(3, 4, 5))
 
 
@@ -386,7 +386,7 @@ def test_fractions_per_transition_and_per_sequence() -> None:
     shapes = {}
     for per in ("sequence", "transition"):
         loss = make_loss(fractions_per=per, num_quantiles=7)
-        fractions = loss.draw(make_batch()).tau
+        fractions = loss.draw_samples(make_batch()).tau
         assert fractions is not None
         shapes[per] = fractions.shape
         assert torch.isfinite(loss(make_batch())["loss_qvalue"])
@@ -396,8 +396,8 @@ def test_fractions_per_transition_and_per_sequence() -> None:
 def test_stratified_fractions_fall_into_a_part_each_and_are_uniform_in_it() -> None:
     loss = make_loss(fraction_sampling="stratified", num_quantiles=7, num_target_quantiles=4, num_risk_samples=2)
     batch = make_batch().repeat(400, 1)
-    draws = loss.draw(batch)
-    for fractions, number in ((draws.tau, 7), (draws.next_tau, 4), (draws.risk_tau, 2)):
+    samples = loss.draw_samples(batch)
+    for fractions, number in ((samples.tau, 7), (samples.next_tau, 4), (samples.risk_tau, 2)):
         assert fractions is not None
         assert fractions.shape == (1200, 1, number)
         within = number * fractions - torch.arange(number)
@@ -537,7 +537,7 @@ def test_targets_come_from_the_target_parameters(
 
     def target() -> Tensor:
         loss.rng_state = torch.Generator().manual_seed(3).get_state()
-        return loss.compute_target(batch, loss.encode_actor(batch), loss.draw(batch))
+        return loss.compute_target(batch, loss.encode_actor(batch), loss.draw_samples(batch))
 
     before = target()
     for parameter in loss.critic_network_params.parameters():

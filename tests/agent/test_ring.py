@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torch.nn import functional as F
 
+from rcdsac_trl.agent.kernels import dispatch
 from rcdsac_trl.agent.kernels.compiled_actor import CompiledActor
 from rcdsac_trl.agent.networks import Encoder
 from rcdsac_trl.deploy.export.modules import ActorStep
@@ -25,7 +26,7 @@ STRIDE = 4
 
 
 def encoder_of(weights: Weights) -> Encoder:
-    encoder = ActorStep(weights).encoder
+    encoder = ActorStep.of_weights(weights).encoder
     assert isinstance(encoder, Encoder)
     return encoder
 
@@ -33,16 +34,17 @@ def encoder_of(weights: Weights) -> Encoder:
 def by_layers(weights: Weights, bins: Tensor) -> Tensor:
     encoder = encoder_of(weights)
     given = bins.new_zeros(1, 6), bins.new_zeros(1, 4), torch.ones(1, 1, dtype=torch.bool), bins.new_zeros(1, 128)
-    return torch.cat([encoder.step(row, *given) for row in bins.split(1)])
+    return torch.cat([encoder.step(row, *given)[0] for row in bins.split(1)])
 
 
 def by_kernels(weights: Weights, bins: Tensor) -> Tensor:
     number = len(bins)
-    return encoder_of(weights)(bins.unsqueeze(1), bins.new_zeros(number, 1, 6), bins.new_zeros(number, 1, 4))[:, 0]
+    vectors = bins.new_zeros(number, 1, 6), bins.new_zeros(number, 1, 4)
+    return dispatch.forward(encoder_of(weights), bins.unsqueeze(1), *vectors)[:, 0]
 
 
 def by_compiled_actor(weights: Weights, bins: Tensor) -> Tensor:
-    module = ActorStep(weights)
+    module = ActorStep.of_weights(weights)
     actor = TensorDictSequential(
         TensorDictModule(module.encoder, in_keys=["range", "waypoint", "velocity"], out_keys=["memory"]),
         TensorDictModule(module.head, in_keys=["memory", "risk"], out_keys=["loc", "scale"]),

@@ -1,17 +1,7 @@
-"""Networks wired to tensor keys: the actor and the critics that learn, and the policy that acts.
-
-Public names::
-
-    build_actor(action_size, vectors, measure | None, network) -> TensorDictSequential   [encoder, head]
-        observations [B,T,..], risk -> memory [B,T,128], loc, scale [B,T,A]
-    build_critic(action_size, vectors, kind="quantile"|"scalar", measure | None, network) -> TensorDictSequential
-        observations, action, (tau, risk) -> memory, quantiles [B,T,N]  |  state_action_value [B,T,1]
-    build_policy(actor, action_spec, generator=None) -> ProbabilisticActor              one step, any batch
-        observations, risk, is_init, recurrent_state -> loc, scale, action, ("next", "recurrent_state")
-    recurrent_state_primer(memory_size) -> TensorDictPrimer
-"""
+"""Networks wired to tensor keys: the actor and the critics that learn, and the policy that acts."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -22,7 +12,14 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from rcdsac_trl.agent.networks import ActorHead, Encoder, NetworkSettings, QuantileHead, ScalarHead
+from rcdsac_trl.agent.networks import (
+    ActorHead,
+    HistoryEncoder,
+    NetworkSettings,
+    QuantileHead,
+    ScalarHead,
+    encoder_class,
+)
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
@@ -34,7 +31,13 @@ STATE_KEY = "recurrent_state"
 
 
 def _encoder(vectors: Mapping[str, int], network: NetworkSettings) -> TensorDictModule:
-    return TensorDictModule(Encoder(vectors, network), in_keys=["range", *vectors], out_keys=[MEMORY_KEY])
+    encoder = encoder_class(network)(vectors, network)
+    return TensorDictModule(encoder, in_keys=["range", *vectors], out_keys=[MEMORY_KEY])
+
+
+def _of_heads(network: NetworkSettings) -> NetworkSettings:
+    """Return what heads are made of: the memory is what they read of it."""
+    return replace(network, memory=encoder_class(network).memory_size_of(network))
 
 
 def build_actor(
@@ -49,7 +52,7 @@ def build_actor(
         action_size: number of action dimensions.
         vectors: name and size of the vector observations; add ``collision_weight: 1`` for RCWR.
         measure: conditions the actor on ``risk``; None for no conditioning.
-        network: sizes of the layers; None for the paper's.
+        network: sizes of the layers, and the encoder; None for the paper's.
 
     Returns:
         Two modules: observations ``[B, T, ..]`` to ``memory`` ``[B, T, 128]``, and ``memory`` (and ``risk``
@@ -62,8 +65,9 @@ def build_actor(
         ['range', 'waypoint', 'velocity', 'risk']
     """
     network = network or NetworkSettings()
+    of_heads = _of_heads(network)
     head = TensorDictModule(
-        ActorHead(action_size, network, measure),
+        ActorHead(action_size, of_heads, measure),
         in_keys=[MEMORY_KEY] if measure is None else [MEMORY_KEY, "risk"],
         out_keys=["loc", "scale"],
     )
@@ -84,15 +88,16 @@ def build_critic(
         vectors: name and size of the vector observations.
         kind: ``"quantile"`` for the distribution of the return at the fractions ``tau``, ``"scalar"`` for its mean.
         measure: conditions a quantile critic on ``risk``; None for no conditioning.
-        network: sizes of the layers; None for the paper's.
+        network: sizes of the layers, and the encoder; None for the paper's.
 
     Raises:
         UserInputError: for an unknown kind, or a scalar critic with a measure.
     """
     network = network or NetworkSettings()
+    of_heads = _of_heads(network)
     head: nn.Module
     if kind == "quantile":
-        head = QuantileHead(action_size, network, measure)
+        head = QuantileHead(action_size, of_heads, measure)
         in_keys = [MEMORY_KEY, "action", "tau"] + ([] if measure is None else ["risk"])
         out_keys = ["quantiles"]
     elif kind == "scalar":
@@ -100,7 +105,7 @@ def build_critic(
             raise UserInputError(
                 f"a scalar critic cannot be conditioned on risk (measure {measure.name!r}): choose critic 'quantile'"
             )
-        head = ScalarHead(action_size, network)
+        head = ScalarHead(action_size, of_heads)
         in_keys, out_keys = [MEMORY_KEY, "action"], ["state_action_value"]
     else:
         raise UserInputError(f"there is no critic {kind!r}: choose 'quantile' or 'scalar'")
@@ -110,13 +115,12 @@ def build_critic(
 class _Step(nn.Module):
     """One-step view of an encoder; shares its parameters."""
 
-    def __init__(self, encoder: Encoder) -> None:
+    def __init__(self, encoder: HistoryEncoder) -> None:
         super().__init__()
         self.encoder = encoder
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        state = self.encoder.step(*inputs)
-        return state, state
+        return self.encoder.step(*inputs)
 
 
 def build_policy(

@@ -6,10 +6,14 @@ encoder pass over the observations of a sequence serves current and next step, d
 
 Pass ``risk`` and ``tau`` with a time dimension of 1 where they are constant along a sequence: the gate is then computed
 once for it.
+
+These layers define what is computed. On a CPU :mod:`rcdsac_trl.agent.kernels.dispatch` runs a compiled twin in their
+place where it knows the module.
 """
 
+import importlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,9 +21,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rcdsac_trl.agent.float32 import made_in_float32
-from rcdsac_trl.agent.kernels.observation_features import observation_features
-from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
-from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import NUM_BINS
@@ -28,13 +29,6 @@ from rcdsac_trl.system.checks import one_of
 
 #: Bounds of the policy's log standard deviation.
 LOG_STD_RANGE = (-20.0, 2.0)
-#: Below this number, one call of a layer costs more than what it computes.
-FEW_OBSERVATIONS = 32
-
-
-def _runs_kernels(x: Tensor) -> bool:
-    """Return whether our kernels know the place: a CPU, and no exporter, which knows layers only."""
-    return x.device.type == "cpu" and not torch.compiler.is_compiling() and not torch.jit.is_tracing()
 
 
 @dataclass(frozen=True)
@@ -49,9 +43,11 @@ class NetworkSettings:
         head: size of every fully-connected layer after the recurrent one, and of the risk gates.
         cosines: number of cosine features of ``beta`` and of a quantile fraction.
         padding: how the convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
+        encoder: an encoder of yours as ``package.module.Class``; see
+            :class:`HistoryEncoder`. None for :class:`Encoder`.
 
     Raises:
-        UserInputError: if a width is below 1, or there is no such padding.
+        UserInputError: if a width is below 1, or there is no such padding or encoder.
     """
 
     conv: int = 32
@@ -61,13 +57,16 @@ class NetworkSettings:
     head: int = 128
     cosines: int = 64
     padding: Padding = "circular"
+    encoder: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse widths below 1 and other paddings."""
+        """Refuse widths below 1, other paddings, and an encoder that cannot be imported."""
         for name, width in self.widths.items():
             if width < 1:
                 raise UserInputError(f"network width {name} = {width} is below 1: give a positive integer")
         one_of("network.padding", self.padding, Padding)
+        if self.encoder is not None:
+            _imported(self.encoder)
 
     @property
     def widths(self) -> dict[str, int]:
@@ -101,29 +100,59 @@ class RangeFeatures(nn.Module):
         return torch.cat((bins[:, NUM_BINS - before :], bins, bins[:, :behind]), dim=1) if before else bins
 
     def forward(self, bins: Tensor) -> Tensor:
-        """Map ``[n, 180]`` to ``[n, features]``; no gradient flows to the bins."""
-        if not _runs_kernels(bins) or len(bins) < FEW_OBSERVATIONS:
-            return self.layers(bins)
-        return observation_features(self.padded(bins), [], self.stack, [])
-
-    @property
-    def stack(self) -> tuple[nn.Conv1d, nn.Conv1d, nn.Linear]:
-        """The layers in their order."""
-        return self.conv_1, self.conv_2, self.linear
-
-    def layers(self, bins: Tensor) -> Tensor:
-        """Compute the same with the layers one by one."""
+        """Map ``[n, 180]`` to ``[n, features]``."""
         positions = F.relu(self.conv_2(F.relu(self.conv_1(self.padded(bins).unsqueeze(1)))))
         return F.relu(self.linear(positions.transpose(1, 2).flatten(1)))
 
 
-@made_in_float32
-class Encoder(nn.Module):
-    """Observation history to memory: per-input features, concatenated, into a GRU.
+class HistoryEncoder(nn.Module):
+    """What an encoder has to be; derive yours from it and name it in ``network.encoder``.
+
+    It runs by its own layers wherever an agent does: losses, acting, evaluation, ``torch.export``.
 
     Args:
         vectors: name and size of every vector observation besides ``range``, in the order of the call, such as
-            ``{"waypoint": 6, "velocity": 4}``; each gets its own linear layer.
+            ``{"waypoint": 6, "velocity": 4}``.
+        network: sizes of the layers.
+
+    Attributes:
+        memory_size: how many numbers the heads read.
+        state_size: how many numbers it carries from step to step: ``network.memory``.
+    """
+
+    def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
+        super().__init__()
+        self.memory_size, self.state_size = self.memory_size_of(network), network.memory
+
+    @classmethod
+    def memory_size_of(cls, network: NetworkSettings) -> int:
+        """Return how many numbers the heads read; all of the state unless you say otherwise."""
+        return network.memory
+
+    def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
+        """Run whole sequences ``[B, T, ..]`` from a zero state; returns the memory ``[B, T, memory_size]``."""
+        raise NotImplementedError
+
+    def step(self, range_: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Advance any batch ``[*]`` of agents by one observation, to what :meth:`forward` gives there.
+
+        Args:
+            range_: range observation ``[*, 180]``.
+            rest: the vector observations ``[*, size]``, then ``is_init`` ``[*, 1]`` (bool: this is the first
+                observation of an episode, so the state is zeroed first), then the state ``[*, state_size]``.
+
+        Returns:
+            The memory that the heads read, ``[*, memory_size]``, and the next state ``[*, state_size]``.
+        """
+        raise NotImplementedError
+
+
+@made_in_float32
+class Encoder(HistoryEncoder):
+    """Observation history to memory: per-input features, concatenated, into a GRU. Its state is its memory.
+
+    Args:
+        vectors: as for :class:`HistoryEncoder`; each gets its own linear layer.
         network: sizes of the layers.
 
     Example:
@@ -134,44 +163,51 @@ class Encoder(nn.Module):
 
     def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
         """Build the layers."""
-        super().__init__()
-        self.memory_size = network.memory
+        super().__init__(vectors, network)
         self.range = RangeFeatures(network.conv, network.range, network.padding)
         self.vectors = nn.ModuleList(nn.Linear(size, network.vector) for size in vectors.values())
         self.gru = nn.GRU(network.range + network.vector * len(vectors), network.memory, batch_first=True)
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
         """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
-        if not _runs_kernels(range_) or range_.shape[:2].numel() < FEW_OBSERVATIONS:
-            return self.gru(self._features(range_, vectors))[0]
-        sequences, steps = range_.shape[:2]
-        # Step after step, as the recurrence reads them.
-        bins, *others = (value.transpose(0, 1).reshape(sequences * steps, -1) for value in (range_, *vectors))
-        features = observation_features(self.range.padded(bins), others, self.range.stack, list(self.vectors))
-        return gated_recurrence(features.view(steps, sequences, -1), self.gru).transpose(0, 1)
+        return self.gru(self.features(range_, vectors))[0]
 
-    def step(self, range_: Tensor, *rest: Tensor) -> Tensor:
-        """Advance any batch ``[*]`` of agents by one observation.
-
-        Args:
-            range_: range observation ``[*, 180]``.
-            rest: the vector observations ``[*, size]``, then ``is_init`` ``[*, 1]`` (bool: this is the first
-                observation of an episode, so the state is zeroed first), then the recurrent state ``[*, memory]``.
-
-        Returns:
-            The next recurrent state ``[*, memory]``, which is also the memory the heads read.
-        """
+    def step(self, range_: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Advance any batch ``[*]`` of agents by one observation; see :meth:`HistoryEncoder.step`."""
         *vectors, is_init, state = rest
-        features = self._features(range_, tuple(vectors))
+        return self.advance(self.features(range_, tuple(vectors)), is_init, state)
+
+    def advance(self, features: Tensor, is_init: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Do the recurrent part of :meth:`step`, from the features ``[*, n]`` of an observation."""
         lead = features.shape[:-1]
         state = torch.where(is_init, torch.zeros_like(state), state).reshape(1, -1, self.memory_size)
-        return self.gru(features.reshape(-1, 1, features.shape[-1]), state)[1].reshape(*lead, self.memory_size)
+        state = self.gru(features.reshape(-1, 1, features.shape[-1]), state)[1].reshape(*lead, self.memory_size)
+        return state, state
 
-    def _features(self, range_: Tensor, vectors: tuple[Tensor, ...]) -> Tensor:
+    def features(self, range_: Tensor, vectors: Sequence[Tensor]) -> Tensor:
+        """Return the rectified features of observations ``[*, ..]``, those of the bins first, ``[*, n]``."""
         lead = range_.shape[:-1]
         parts = [self.range(range_.reshape(-1, NUM_BINS)).reshape(*lead, -1)]
         parts += [F.relu(layer(value)) for layer, value in zip(self.vectors, vectors, strict=True)]
         return torch.cat(parts, dim=-1)
+
+
+def encoder_class(network: NetworkSettings) -> type[HistoryEncoder]:
+    """Return :class:`Encoder`, or the class that ``network.encoder`` names."""
+    return Encoder if network.encoder is None else _imported(network.encoder)
+
+
+def _imported(path: str) -> type[HistoryEncoder]:
+    module, _, name = path.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UserInputError(
+            f"network.encoder={path} cannot be imported ({error}): name a class as package.module.Class"
+        ) from error
+    if not isinstance(found, type) or not issubclass(found, HistoryEncoder):
+        raise UserInputError(f"network.encoder={path} is no HistoryEncoder: derive it from rcdsac_trl.agent.networks'")
+    return found
 
 
 @made_in_float32
@@ -264,23 +300,18 @@ class QuantileHead(nn.Module):
             tau: fractions in [0, 1], ``[B, L, N]`` or, the same along a sequence, ``[B, 1, N]``.
             risk: ``beta``, ``[B, L, 1]`` or ``[B, 1, 1]``; not read without a measure.
         """
-        beta = None
-        if self.measure is not None:
-            if risk is None:
-                raise ValueError("this critic is conditioned on risk: pass it")
-            beta = self.cosines(self.measure.embed(risk).squeeze(-1))
-        if not _runs_kernels(memory):
-            return self.layers(memory, action, tau, beta)
-        return quantile_values(memory, action, tau, beta, self.cosines.frequencies, self.stack)
+        return self.layers(memory, action, tau, self.beta_cosines(risk))
 
-    @property
-    def stack(self) -> HeadLayers:
-        """The linear layers."""
-        gate_beta = None if self.measure is None else self.gate_beta
-        return HeadLayers(self.input, self.gate_tau, gate_beta, self.hidden, self.output)
+    def beta_cosines(self, risk: Tensor | None) -> Tensor | None:
+        """Return the cosines of ``beta``, ``[B, L|1, cosines]``; None without a measure."""
+        if self.measure is None:
+            return None
+        if risk is None:
+            raise ValueError("this critic is conditioned on risk: pass it")
+        return self.cosines(self.measure.embed(risk).squeeze(-1))
 
     def layers(self, memory: Tensor, action: Tensor, tau: Tensor, beta: Tensor | None) -> Tensor:
-        """Compute the same from beta's cosines, layer by layer."""
+        """Do what follows beta's cosines."""
         x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
         gate = self.gate_tau(self.cosines(tau))
         if beta is not None:

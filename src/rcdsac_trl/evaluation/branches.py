@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from rcdsac_trl.agent.actor import STATE_KEY
+from rcdsac_trl.agent.kernels import dispatch
 from rcdsac_trl.agent.loss.distributional_sac import OVER_CRITICS, DistributionalSACLoss
 from rcdsac_trl.agent.loss.functional import call_module, squash
 from rcdsac_trl.rollout.evaluation_pool import Rows
@@ -85,8 +86,9 @@ def roll_out(
     tensordict = env.reset(episode=episode)
     for step in range(max(branch_steps) + horizon_steps):
         before_step()
-        state = encoder.module.step(*[tensordict[key] for key in (*encoder.in_keys, "is_init", STATE_KEY)])
-        loc, scale = head.module(state, *[tensordict[key] for key in head.in_keys[1:]])
+        seen = [tensordict[key] for key in (*encoder.in_keys, "is_init", STATE_KEY)]
+        memory, state = dispatch.step(encoder.module, *seen)
+        loc, scale = head.module(memory, *[tensordict[key] for key in head.in_keys[1:]])
         noise = torch.empty_like(loc[: len(loc) // num_blocks]).normal_(generator=generator).repeat(num_blocks, 1)
         action, log_prob = squash(loc, scale, noise)
         # Of equal rows a matrix product need not make equal bits.

@@ -1,9 +1,4 @@
-"""The quantile Huber loss on a CPU, in one compiled pass that makes no table of pairs.
-
-Public names::
-
-    quantile_huber(quantiles [..,N], targets [..,N'], tau [..,N], kappa) -> [..]
-"""
+"""The quantile Huber loss on a CPU, in one compiled pass that makes no table of pairs."""
 
 from typing import Any
 

@@ -12,11 +12,11 @@ from torch.nn import functional as F
 from torchrl.objectives.utils import _reduce
 from torchrl.objectives.value.functional import td0_return_estimate
 
-from rcdsac_trl.agent.loss.batch_threads import cut, in_parts
+from rcdsac_trl.agent.loss.batch_threads import parallel_backward, split_batch
 from rcdsac_trl.agent.loss.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
 from rcdsac_trl.agent.loss.linked_loss import LinkedLoss
 from rcdsac_trl.agent.loss.loss_settings import LossSettings
-from rcdsac_trl.agent.loss.samples import Draws, draw
+from rcdsac_trl.agent.loss.samples import LossSamples, draw_samples
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
 
 #: What a target can take of the target critics.
@@ -119,59 +119,59 @@ class DistributionalSACLoss(LinkedLoss):
                 f"expected a batch [sequences, steps + 1] with more than burn_in = {self.settings.burn_in} steps, "
                 f"got {list(tensordict.shape)}"
             )
-        draws = self.draw(tensordict)
+        samples = self.draw_samples(tensordict)
         if self.reduction == "none":
-            losses, diagnostics = self._losses(tensordict, draws)
+            losses, diagnostics = self._losses(tensordict, samples)
             diagnostics["alpha"] = self.alpha.expand_as(losses["loss_actor"])
             return TensorDict(losses | diagnostics, batch_size=losses["loss_actor"].shape)
-        parts = cut(*draws.noise.shape[:2])
-        if len(parts) == 1 or not torch.is_grad_enabled() or draws.noise.device.type != "cpu":
-            return TensorDict(self._reduced(tensordict, draws))
+        parts = split_batch(*samples.noise.shape[:2])
+        if len(parts) == 1 or not torch.is_grad_enabled() or samples.noise.device.type != "cpu":
+            return TensorDict(self._reduced(tensordict, samples))
 
         def compute(part: slice) -> dict[str, Tensor]:
             share = (part.stop - part.start) / len(tensordict)
             summed = self._trained if self.reduction == "sum" else {}
-            reduced = self._reduced(tensordict[part], draws.rows(part))
+            reduced = self._reduced(tensordict[part], samples.rows(part))
             return {key: value if key in summed else share * value for key, value in reduced.items()}
 
-        return TensorDict(in_parts(compute, self._trained, parts))
+        return TensorDict(parallel_backward(compute, self._trained, parts))
 
-    def _losses(self, tensordict: TensorDictBase, draws: Draws) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _losses(self, tensordict: TensorDictBase, samples: LossSamples) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return the losses and detached diagnostics, ``[B, L - burn_in]`` but for ``alpha``."""
         actor_memory = self.encode_actor(tensordict)
-        loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory, draws)
-        loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories, draws)
+        loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory, samples)
+        loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories, samples)
         loss_alpha = -self.log_alpha * (log_prob + self.settings.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha}
         return losses, diagnostics | {"alpha": self.alpha, "entropy": -log_prob}
 
-    def _reduced(self, tensordict: TensorDictBase, draws: Draws) -> dict[str, Tensor]:
+    def _reduced(self, tensordict: TensorDictBase, samples: LossSamples) -> dict[str, Tensor]:
         """Return the reduced losses and the diagnostics' means."""
-        losses, diagnostics = self._losses(tensordict, draws)
+        losses, diagnostics = self._losses(tensordict, samples)
         reduced = {key: _reduce(value, self.reduction) for key, value in losses.items()}
         return reduced | {key: value.mean() for key, value in diagnostics.items()}
 
-    def draw(self, tensordict: TensorDictBase) -> Draws:
+    def draw_samples(self, tensordict: TensorDictBase) -> LossSamples:
         """Draw all random numbers that a batch ``[B, L+1]`` needs."""
         numbers = (self.settings.num_target_quantiles, self.settings.num_quantiles, self.settings.num_risk_samples)
         action = tensordict.get(self.tensor_keys.action)[:, self.settings.burn_in : -1]
         sampling = self.settings.fractions_per, self.settings.fraction_sampling
-        return draw(action, numbers if self._distributional else None, *sampling, self._generator)
+        return draw_samples(action, numbers if self._distributional else None, *sampling, self._generator)
 
     def encode_actor(self, tensordict: TensorDictBase) -> Tensor:
         """Return the actor's memory of every observation, ``[B, L + 1 - burn_in, memory]``."""
         return self._encode(self.actor_network, tensordict)
 
-    def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor, draws: Draws) -> Tensor:
+    def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples) -> Tensor:
         """Return the target samples ``[B, L - burn_in, N']`` (scalar critics: N' = 1), without gradient."""
         risk = self._risk(tensordict)
         with torch.no_grad():
-            action, log_prob = self._act(actor_memory[:, 1:], risk, draws.next_noise)
+            action, log_prob = self._act(actor_memory[:, 1:], risk, samples.next_noise)
             _ = self.target_critic_network_params  # TorchRL warns here where nothing updates them
             values = []
             for critic in self._target_critics:
                 memory = self._encode(critic, tensordict)[:, 1:]
-                values.append(self._evaluate(critic, memory, action, draws.next_tau, risk))
+                values.append(self._evaluate(critic, memory, action, samples.next_tau, risk))
             next_value = OVER_CRITICS[self.settings.target_over_critics](values)
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
             # What TorchRL's estimator calls, with its shapes: every target fraction gets its own entry.
@@ -180,14 +180,14 @@ class DistributionalSACLoss(LinkedLoss):
             return td0_return_estimate(self.value_estimator.gamma, next_value, reward, terminated)
 
     def qvalue_loss(
-        self, tensordict: TensorDictBase, actor_memory: Tensor, draws: Draws
+        self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples
     ) -> tuple[Tensor, list[Tensor], dict[str, Tensor]]:
         """Return the critic loss, the critics' memories for :meth:`actor_loss`, and detached diagnostics.
 
         The loss ``[B, L - burn_in]`` is summed over the critics; a memory is ``[B, L - burn_in, memory]``.
         """
-        target = self.compute_target(tensordict, actor_memory, draws)
-        action, risk, tau = self._transitions(tensordict, self.tensor_keys.action), self._risk(tensordict), draws.tau
+        target = self.compute_target(tensordict, actor_memory, samples)
+        action, risk, tau = self._transitions(tensordict, self.tensor_keys.action), self._risk(tensordict), samples.tau
         # No transition starts at the last observation.
         memories = [self._encode(critic, tensordict, stop=-1) for critic in self._critics]
         values = [
@@ -201,11 +201,11 @@ class DistributionalSACLoss(LinkedLoss):
         return torch.stack(errors).sum(0), memories, self._diagnose(values, target)
 
     def actor_loss(
-        self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor], draws: Draws
+        self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor], samples: LossSamples
     ) -> tuple[Tensor, Tensor]:
         """Return the actor loss and the detached log density of its action, both ``[B, L - burn_in]``."""
-        risk, tau = self._risk(tensordict), draws.risk_tau
-        action, log_prob = self._act(actor_memory[:, :-1], risk, draws.noise)
+        risk, tau = self._risk(tensordict), samples.risk_tau
+        action, log_prob = self._act(actor_memory[:, :-1], risk, samples.noise)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
         values = [

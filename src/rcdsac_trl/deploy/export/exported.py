@@ -65,7 +65,7 @@ def export_agent(weights: Weights, num_quantiles: int = 16) -> Exported:
     """
     fractions = fractions_of(num_quantiles)
     modules: tuple[nn.Module, nn.Module] = (
-        ActorStep(weights).eval(),
+        ActorStep.of_weights(weights).eval(),
         CriticStep(weights, torch.from_numpy(fractions)).eval(),
     )
     inputs = example_inputs(weights)
