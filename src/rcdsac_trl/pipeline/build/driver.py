@@ -21,7 +21,9 @@ from rcdsac_trl.pipeline.build.world import evaluation_team
 from rcdsac_trl.pipeline.drivers import Drive, Rows
 from rcdsac_trl.pipeline.evaluation import measure_map
 from rcdsac_trl.pipeline.metrics import Condition
-from rcdsac_trl.pipeline.policies import AgentNoise, PursuitPolicy
+from rcdsac_trl.pipeline.planners.baselines import PURSUIT, baseline_policy
+from rcdsac_trl.pipeline.planners.controller import ControllerPolicy
+from rcdsac_trl.pipeline.policies import AgentNoise
 from rcdsac_trl.pipeline.predictions import QuantilePredictor
 from rcdsac_trl.pipeline.run_settings import TrainingSettings
 from rcdsac_trl.pipeline.settings import WorldSettings
@@ -52,6 +54,7 @@ class Course:
         threads: that torch uses for one operation while it drives.
         trips: measure the ways driven, too.
         controller: settings of controllers, which then tell all agents beta; None: nothing turns it.
+        baseline: what drives where there is no actor.
     """
 
     trained: TrainingSettings
@@ -65,6 +68,7 @@ class Course:
     threads: int
     trips: bool = False
     controller: ControllerSettings | None = None
+    baseline: str = PURSUIT
 
 
 class Agent(NamedTuple):
@@ -87,7 +91,7 @@ def driver(
 
     Args:
         course: what is driven.
-        actor: the actor's weights, packed; None: pursuit drives, which is told nothing.
+        actor: the actor's weights, packed; None: the baseline drives, which is told nothing.
         loss: the loss with the critics, packed; read where a condition's controller needs their quantiles.
         wrap: puts something around the policy, which may change nothing of what it does.
     """
@@ -98,8 +102,13 @@ def driver(
     team = evaluation_team(
         course.world, algo, course.conditions, course.split, course.seed, course.num_episodes, memory
     )
-    noise = AgentNoise(range(len(course.conditions) * course.num_episodes))
-    policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
+    agent_ids = range(len(course.conditions) * course.num_episodes)
+    noise = AgentNoise(agent_ids)
+    if actor is None:
+        policy = baseline_policy(course.baseline, sensor=course.world.sensor, agent_ids=agent_ids, seed=course.seed)
+    else:
+        policy = _policy(course, actor, noise)
+    planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, course)] if course.trips else []
     if course.controller is not None:
         policy = adaptive = _adaptive(course, course.controller, policy, loss)
@@ -110,6 +119,8 @@ def driver(
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         # By the map's number, so that it does not matter which process drives it.
         noise.begin(course.seed, "evaluation actions", map_index)
+        if planner is not None:
+            planner.set_map(map_index)
         return measure_map(
             team,
             policy,

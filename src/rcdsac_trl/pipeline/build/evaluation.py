@@ -22,6 +22,7 @@ from rcdsac_trl.pipeline.cli import compose
 from rcdsac_trl.pipeline.drivers import Rows, drive_maps, resolve_processes
 from rcdsac_trl.pipeline.evaluation import EvaluationRun
 from rcdsac_trl.pipeline.metrics import Condition
+from rcdsac_trl.pipeline.planners.baselines import PURSUIT, check_baseline, settings_of
 from rcdsac_trl.pipeline.run_settings import EvaluationSettings, TrainingSettings
 from rcdsac_trl.pipeline.saved import CHECKPOINTS, Name, find
 from rcdsac_trl.pipeline.settings import WorldSettings
@@ -35,7 +36,8 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     """Make an evaluation of a run or a baseline; refuses before anything is written.
 
     Raises:
-        UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit.
+        UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit, a
+            baseline that cannot drive.
     """
     settings = evaluation_settings(cfg)
     if settings.record:
@@ -47,6 +49,8 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
     # The bandit's episodes are among those of the fixed values: none is driven for it.
     driven = [*conditions, *(Condition(controller=name) for name in controllers if name != BANDIT)]
     world = _evaluation_world(settings, trained, len(driven))
+    if settings.baseline is not None:
+        check_baseline(settings.baseline, world.sensor)
     device = runtime.resolve_device(settings.device)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
     simulations = max(1, processes) * world.num_agents
@@ -59,7 +63,7 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         told = "".join(f"-{name}".replace("=", "_") for name in [*map(str, conditions), *controllers])
         default_out = Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{told}"
     else:
-        default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}"
+        default_out = Path("evaluation") / f"{settings.baseline}-{world.sensor}-{name}".replace(":", "-")
 
     course = Course(
         trained=trained,
@@ -73,6 +77,7 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         threads=1 if settings.threads == "auto" else settings.threads,
         trips=True,
         controller=settings.controller if controllers else None,
+        baseline=settings.baseline or PURSUIT,
     )
 
     @cache  # Read once: a training that goes on may write another checkpoint meanwhile.
@@ -103,7 +108,11 @@ def evaluation(cfg: DictConfig) -> EvaluationRun:
         "map": asdict(world.map_settings),
         "task": asdict(world.task),
         "commit": logs.commit(),
-    } | ({"controller": asdict(settings.controller)} if controllers else {})
+    }
+    if controllers:
+        described["controller"] = asdict(settings.controller)
+    if settings.baseline is not None:
+        described |= settings_of(settings.baseline)
     return EvaluationRun(
         out=Path(settings.out) if settings.out is not None else default_out,
         described=described,
