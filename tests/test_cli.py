@@ -222,8 +222,8 @@ RUN = "run=<the tiny run>"
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ([], "name what to evaluate: either run=<folder> or baseline=pursuit"),
-        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=pursuit"),
+        ([], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
+        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
         (["run=nowhere"], "run=nowhere holds no config.yaml: name a folder that training wrote"),
         (["run=123"], "run=123 must be text or null"),
         ([RUN], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
@@ -271,7 +271,8 @@ RUN = "run=<the tiny run>"
         ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
         ([RUN, "beta=[-2,-1]", "controller.step_size=0"], "controller.step_size=0 must be above 0"),
         ([RUN, "beta=[-2,-1]", "controller.exploration=2"], "controller.exploration=2 must be from 0 to 1"),
-        (["baseline=random"], "baseline=random must be pursuit or null"),
+        (["baseline=random"], "baseline=random is unknown: choose one of pursuit, dwa, mppi, or <module>:<class>"),
+        (["baseline=3"], "baseline=3 must be text or null"),
         (["baseline=pursuit", "beta=[-1]"], "baseline=pursuit has neither beta nor collision weight: leave them out"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -175,11 +175,12 @@ def tracked(velocity: tuple[float, float], steps: int, sensor: NDArray[np.bool_]
 
 
 def test_a_disc_that_walks_is_tracked_with_its_velocity() -> None:
-    (x, y, vx, vy, radius), *others = tracked((0.0, 0.4), steps=15).moving
+    (x, y, vx, vy, radius, unseen_s), *others = tracked((0.0, 0.4), steps=15).moving
     assert not others
     assert (x, y) == pytest.approx((1.8, -0.5 + 0.4 * PERIOD_S * 14), abs=0.1)
     assert (vx, vy) == pytest.approx((0.0, 0.4), abs=0.12)
     assert radius == TrackSettings().radius_m
+    assert unseen_s == 0.0
 
 
 def test_what_stands_does_not_move() -> None:
@@ -203,8 +204,18 @@ def test_a_track_goes_on_unseen_for_its_time() -> None:
 def test_the_map_leaves_out_what_moves() -> None:
     seen = Scene(circles=[DISC]).observation()[0]
     local_map = LocalMap(LocalMapSettings(), NARROW)
-    local_map.observe(seen, np.array([(1.2, 0.0, 0.0, 0.3, 0.25)]))
+    local_map.observe(seen, np.array([(1.2, 0.0, 0.0, 0.3, 0.25, 0.0)]))
     assert local_map.distance_m(1.0, 0.0) == pytest.approx(0.8)
+
+
+def test_what_is_seen_now_stays_where_a_track_only_guesses() -> None:
+    guess = np.array([(1.2, 0.0, 0.0, 0.3, 0.25, 0.14)])
+    local_map = LocalMap(LocalMapSettings(), NARROW)
+    local_map.observe(Scene(circles=[DISC]).observation()[0], guess)
+    assert local_map.distance_m(1.0, 0.0) <= WITHIN_A_CELL_M
+    local_map.move(0.0, 0.0, PERIOD_S)
+    local_map.observe(np.full(180, 0.5), guess)  # looks at something nearer
+    assert local_map.distance_m(1.0, 0.0) > 0.4
 
 
 # ------------------------------------------------------------------------------------------------ cost to go

@@ -16,7 +16,7 @@ from rcdsac_trl.interface import MAX_RANGE_M, NUM_BINS
 
 _BIN_RAD = 2.0 * math.pi / NUM_BINS
 _NEVER = -math.inf
-_NOTHING = np.empty((0, 5))
+_NOTHING = np.empty((0, 6))
 
 
 @dataclass(frozen=True)
@@ -24,24 +24,24 @@ class LocalMapSettings:
     """What a local map holds.
 
     Attributes:
-        size_m: side of the square around the robot that is remembered, m. At 0.6 m/s a planner looks at most 1.7 m
-            ahead, and a robot's radius and its margin further.
-        cell_m: side of a cell, m. Half of it is how far a point is moved at most, which must be small beside the
-            robot's radius of 0.25 m; the time a decision takes grows with its inverse square.
-        memory_s: age at which a point is forgotten, s. Longer than it takes to pass and round what was seen
-            (2 m at 0.25 m/s); what has walked away unseen, and odometry's drift, are then gone as well.
+        size_m: side of the square around the robot that is remembered, m. With 4.8 m it drives as safely, but now and
+            then goes to and fro between two ways that it has both forgotten; 9.6 m takes 1.5 times as long.
+        cell_m: side of a cell, m. Half of it is how far a point is moved at most, which must be small beside what is
+            left in a door; the time a decision takes grows with its inverse square.
+        memory_s: age at which a point is forgotten, s. With 8 s there are twice as many collisions on validation maps.
+            What odometry has lost by then is what limits it.
         clearing_margin_m: a remembered point goes when its sector sees this much farther than it, m. About what a
             point has moved by cell, sector and odometry since it was seen.
         mover_margin_m: points this near to a thing that moves are its own, m; about what its place is uncertain by.
-        reach_m: distances to points are computed up to here, m; the farthest at which anything is weighed.
+        reach_m: distances to points are computed up to here, m: the robot's radius, the margin of its costs, and some.
 
     Raises:
         UserInputError: if a value is outside its limits.
     """
 
-    size_m: float = 4.8
+    size_m: float = 7.2
     cell_m: float = 0.05
-    memory_s: float = 8.0
+    memory_s: float = 16.0
     clearing_margin_m: float = 0.1
     mover_margin_m: float = 0.2
     reach_m: float = 0.8
@@ -125,13 +125,13 @@ class LocalMap:
 
         Args:
             ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m.
-            moving: what moves, float64 [k, 5]; see :attr:`.mover_tracks.MoverTracks.moving`.
+            moving: what moves, float64 [k, 6]; see :attr:`.mover_tracks.MoverTracks.moving`.
         """
         settings = self.settings
         _forget(self.points, self._time_s - settings.memory_s, self.pose, 0.5 * settings.size_m)
         _clear(self.points, self.pose, ranges_m, self.sensed, settings.clearing_margin_m)
         _add(self.points, self._time_s, self.pose, ranges_m, self.sensed, settings.cell_m)
-        _take_out(self.points, moving, settings.mover_margin_m)
+        _take_out(self.points, self._time_s, moving, settings.mover_margin_m)
         _measure(self.field_m, self.points, self.pose, settings.cell_m, settings.reach_m)
 
     @property
@@ -214,16 +214,17 @@ def _add(
 
 
 @numba.njit(cache=True)
-def _take_out(points: np.ndarray, moving: np.ndarray, margin_m: float) -> None:
-    """Drop the points of what moves."""
+def _take_out(points: np.ndarray, time_s: float, moving: np.ndarray, margin_m: float) -> None:
+    """Drop the points of what moves, but for those seen now where it is itself not seen: its place is a guess then."""
     if len(moving) == 0:
         return
     for i in range(points.shape[0]):
         for j in range(points.shape[1]):
             if points[i, j, 2] == _NEVER:
                 continue
-            for x, y, _, _, radius in moving:
-                if math.hypot(points[i, j, 0] - x, points[i, j, 1] - y) < radius + margin_m:
+            for x, y, _, _, radius, unseen_s in moving:
+                near = math.hypot(points[i, j, 0] - x, points[i, j, 1] - y) < radius + margin_m
+                if near and (unseen_s == 0.0 or points[i, j, 2] < time_s):
                     points[i, j, 2] = _NEVER
 
 

@@ -44,21 +44,22 @@ class CostSettings:
     to 0.5 while turning, as the task pays it.
 
     Attributes:
-        collision_m: a step that touches something, m; twice that with its point at the robot's centre, so that a
-            robot that touches knows the way out. A few of them outweigh all that a horizon can gain.
-        margin_m: gap below which nearness costs, m: half of what is left beside the robot in a door of 0.9 m is 0.2.
-        near_m_per_s: a second at gap 0, m; it falls as a square to 0 at the margin.
-        near_price: what a metre of way costs more at gap 0, m; it falls likewise. It leads the way through the middle
-            of gaps.
-        blocked_price: what a metre through what is in the way costs, m; finite, since it may have walked off.
-        ahead_m: a trajectory is continued straight by this, m; so turning towards the way is worth something.
-        reverse: what a metre backwards costs more, m: where it leads no sensor looks.
-        goal_m: reaching the goal, m; the task pays 10, as much as 1.4 s at full speed.
+        collision_m: a step that pushes into something, m; one costs more than a horizon can gain, 2 m.
+        margin_m: gap below which nearness costs, m: in the narrowest door, 0.9 m, 0.2 are left on either side.
+        near_m_per_s: a second at gap 0, m; it falls as a square to 0 at the margin. Full speed gains 0.72 m in it, so
+            it pays to go around, and to pass where there is no way around.
+        near_price: what a metre of way costs more at gap 0, m; it falls likewise, and leads ways through the middle of
+            gaps.
+        blocked_price: what a metre of way through something costs, m; finite, since it may have walked off when the
+            robot is there.
+        ahead_m: a trajectory is continued straight by this, m, so that it is worth something to face the way.
+        reverse: what a metre backwards costs more, m: the sensor does not look there.
+        goal_m: what reaching the goal gains, m; the task pays 10, or 1.4 m.
         waypoint_radius_m: within it the next waypoint gives way to the one after, m; the task's.
         goal_radius_m: within it the goal is reached, m; the task's.
 
     Raises:
-        UserInputError: if a value is negative, or a length that divides is 0.
+        UserInputError: if a value is negative, or the margin is 0.
     """
 
     collision_m: float = 3.0
@@ -270,7 +271,7 @@ def _cost(
         y += driven_m * math.sin(yaw + 0.5 * turn)
         yaw += turn
         gap = _value_at(field_m, x0, y0, cell_m, x, y) - ROBOT_RADIUS_M
-        for disc_x, disc_y, disc_vx, disc_vy, radius in moving:
+        for disc_x, disc_y, disc_vx, disc_vy, radius, _ in moving:
             away_x, away_y = x - disc_x - disc_vx * (t + 1) * PERIOD_S, y - disc_y - disc_vy * (t + 1) * PERIOD_S
             gap = min(gap, math.hypot(away_x, away_y) - radius - ROBOT_RADIUS_M)
         if gap < 0.0 and gap < gap_before:
