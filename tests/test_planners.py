@@ -3,9 +3,11 @@
 import itertools
 import json
 import math
+import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -522,6 +524,15 @@ def test_settings_refuse(settings: Callable[[], object], sentence: str) -> None:
     with pytest.raises(UserInputError) as refused:
         settings()
     assert str(refused.value) == sentence
+
+
+# ------------------------------------------------------------------------------------------------ documents
+@pytest.mark.parametrize("settings", [MppiSettings, DwaSettings, CostSettings, LocalMapSettings, TrackSettings])
+def test_the_page_tells_every_parameter(settings: Callable[[], Any]) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "planners.md").read_text()
+    table = page.split(f"**`{settings.__name__}`**")[1].split("\n**")[0].split("\n## ")[0]
+    told = {name: float(value) for name, value in re.findall(r"^\| `(\w+)` \| (\S+) \|", table, re.M)}
+    assert told == {name: value for name, value in asdict(settings()).items() if name != "common"}
 
 
 # ------------------------------------------------------------------------------------------------ evaluation

@@ -25,11 +25,12 @@ class LocalMapSettings:
 
     Attributes:
         size_m: side of the square around the robot that is remembered, m. With 4.8 m it drives as safely, but now and
-            then goes to and fro between two ways that it has both forgotten; 9.6 m takes 1.5 times as long.
+            then goes to and fro between two ways that it has both forgotten; with 9.6 m a decision takes 1.5 times as
+            long.
         cell_m: side of a cell, m. Half of it is how far a point is moved at most, which must be small beside what is
             left in a door; the time a decision takes grows with its inverse square.
-        memory_s: age at which a point is forgotten, s. With 8 s there are twice as many collisions on validation maps.
-            What odometry has lost by then is what limits it.
+        memory_s: age at which a point is forgotten, s. MPPI collided 0.15 times an episode with 8 s and 0.07 times with
+            16 s, on validation maps. What odometry has lost by then is what limits it.
         clearing_margin_m: a remembered point goes when its sector sees this much farther than it, m. About what a
             point has moved by cell, sector and odometry since it was seen.
         mover_margin_m: points this near to a thing that moves are its own, m; about what its place is uncertain by.
