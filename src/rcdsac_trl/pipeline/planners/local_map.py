@@ -30,7 +30,7 @@ class LocalMapSettings:
         cell_m: side of a cell, m. Half of it is how far a point is moved at most, which must be small beside what is
             left in a door; the time a decision takes grows with its inverse square.
         memory_s: age at which a point is forgotten, s. MPPI collided 0.15 times an episode with 8 s and 0.07 times with
-            16 s, on validation maps. What odometry has lost by then is what limits it.
+            16 s, on validation maps; longer was not tried.
         clearing_margin_m: a remembered point goes when its sector sees this much farther than it, m. About what a
             point has moved by cell, sector and odometry since it was seen.
         mover_margin_m: points this near to a thing that moves are its own, m; about what its place is uncertain by.
