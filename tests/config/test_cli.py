@@ -223,8 +223,8 @@ RUN = "run=<the tiny run>"
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ([], "name what to evaluate: either run=<folder> or baseline=pursuit"),
-        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=pursuit"),
+        ([], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
+        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
         (["run=nowhere"], "run=nowhere holds no config.yaml: name a folder that training wrote"),
         (["run=123"], "run=123 must be text or null"),
         ([RUN], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
@@ -273,7 +273,8 @@ RUN = "run=<the tiny run>"
             "controller.near_m=2 must be above 0 and below controller.far_m=1.2",
         ),
         ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
-        (["baseline=random"], "baseline=random must be pursuit or null"),
+        (["baseline=random"], "baseline=random is unknown: choose one of pursuit, dwa, mppi, or <module>:<class>"),
+        (["baseline=3"], "baseline=3 must be text or null"),
         (["baseline=pursuit", "beta=[-1]"], "baseline=pursuit has neither beta nor collision weight: leave them out"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -81,7 +81,7 @@ class EvaluationSettings:
     beta_controller: tuple[Literal["clearance", "tail_variance"], ...] | None
     controller: ControllerSettings
     checkpoint: Name
-    baseline: Literal["pursuit"] | None
+    baseline: str | None
     split: Literal["evaluation", "validation"]
     seed: int
     num_maps: int
@@ -101,7 +101,7 @@ class EvaluationSettings:
     def __post_init__(self) -> None:
         """Refuse what is below its limit, and neither or both of run and baseline."""
         if (self.run is None) == (self.baseline is None):
-            raise UserInputError("name what to evaluate: either run=<folder> or baseline=pursuit")
+            raise UserInputError("name what to evaluate: either run=<folder> or baseline=<name>, such as mppi")
         if self.out == "":
             raise UserInputError("out names no folder: give it one, or leave it out")
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):

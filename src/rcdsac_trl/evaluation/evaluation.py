@@ -23,6 +23,7 @@ from rcdsac_trl.rollout.make_agent import make_average, make_loss, packed, packe
 from rcdsac_trl.rollout.map_evaluator import Agent, Course, driver
 from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS, table_of
 from rcdsac_trl.rollout.metrics import summarise
+from rcdsac_trl.rollout.planners.baselines import PURSUIT, check_baseline, settings_of
 from rcdsac_trl.storage.checkpoint import load_weights
 from rcdsac_trl.storage.checkpoint_record import find
 from rcdsac_trl.system import resources, runtime
@@ -38,13 +39,16 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     It writes ``episodes.csv``, ``summary.csv``, ``evaluation.json`` and, if asked for, films.
 
     Raises:
-        UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit.
+        UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit, a
+            baseline that cannot drive.
     """
     settings = read_config(cfg, EvaluationSettings)
     if settings.record:
         check_extra()
     trained = _trained(settings)
     course = _course(settings, trained)
+    if settings.baseline is not None:
+        check_baseline(settings.baseline, course.world.sensor)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
     simulations = max(1, processes) * course.world.num_agents
     remedy = "lower num_episodes or num_workers, or end other programs"
@@ -94,6 +98,7 @@ def _course(settings: EvaluationSettings, trained: TrainingSettings) -> Course:
         threads=1 if settings.threads == "auto" else settings.threads,
         trips=True,
         controller=settings.controller if controllers else None,
+        baseline=settings.baseline or PURSUIT,
     )
 
 
@@ -105,7 +110,7 @@ def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
 def _default_out(settings: EvaluationSettings, course: Course) -> Path:
     name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
     if settings.run is None:
-        return Path("evaluation") / f"{settings.baseline}-{course.world.sensor}-{name}"
+        return Path("evaluation") / f"{settings.baseline}-{course.world.sensor}-{name}".replace(":", "-")
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in course.conditions)
     return Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{contexts}"
 
@@ -129,7 +134,9 @@ def _described(settings: EvaluationSettings, course: Course) -> dict[str, Any]:
         "task": asdict(course.world.task),
         "commit": commit(),
     }
-    return described | ({} if course.controller is None else {"controller": asdict(course.controller)})
+    if course.controller is not None:
+        described["controller"] = asdict(course.controller)
+    return described if settings.baseline is None else described | settings_of(settings.baseline)
 
 
 def _findings(rows: Rows) -> Findings:

@@ -32,7 +32,7 @@ def write_film(
 
     Args:
         course: what is driven.
-        agent: what drives; None: pursuit drives.
+        agent: what drives; None: the baseline drives.
         video: which episode is filmed.
         headings: one a condition.
         folder: takes the files.
