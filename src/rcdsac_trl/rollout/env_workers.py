@@ -1,19 +1,20 @@
 """The worker processes of a ``ParallelEnv``, seen from outside: who died, who hangs.
 
-TorchRL's environment says that a worker is dead or that an answer took too long, but neither who it was nor how it
-ended, and when it is closed it waits for those that are stopped.
+TorchRL's environment raises errors that name a worker by its number alone, or none where an answer took too long, and
+when it is closed it waits for workers that are stopped.
 """
 
+import contextlib
 import multiprocessing
-import time
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from multiprocessing.process import BaseProcess
 
 from rcdsac_trl.system.processes import WorkerError, ending
 
-# A pipe can be broken an instant before its process counts as dead.
-_DEATH_S = 1.0
-_LOOK_S = 0.01
+# What TorchRL says of a worker that is gone, and of an answer that took too long.
+_GONE = re.compile(r"worker (\d+) \(exit code (-?\d+)\)")
+_LATE = "time limit"
 
 
 class EnvWorkers:
@@ -35,34 +36,34 @@ class EnvWorkers:
         self._before = {process.pid for process in multiprocessing.active_children()}
 
     def started(self) -> None:
-        """Take the processes that came since as the workers, in the order in which they were started."""
+        """Take the processes that came since as the workers."""
         if self._described:
-            new = [each for each in multiprocessing.active_children() if each.pid not in self._before]
-            self._processes = sorted(new, key=lambda process: int(process.name.rpartition("-")[2]))
+            self._processes = [each for each in multiprocessing.active_children() if each.pid not in self._before]
 
     def fault(self, error: Exception) -> WorkerError | None:
-        """Say which worker is to blame for an error of the environment; None: none is.
-
-        Workers that died are named with how they ended. Where all live and TorchRL gave up waiting, they hang.
-        """
-        until_s = time.monotonic() + _DEATH_S
-        while self._processes and time.monotonic() < until_s:
-            for number, process in enumerate(self._processes):
-                if not process.is_alive():
-                    return self._error(number, ending(process.exitcode))
-            if "time limit" in str(error):
+        """Say which worker is to blame for an error of the environment; None: none is."""
+        number = len(self._described)
+        for cause in _chain(error):
+            if gone := _GONE.search(str(cause)):
+                worker, how = int(gone[1]), ending(int(gone[2]))
+                return WorkerError(f"worker process {worker + 1} of {number} ({self._described[worker]}) {how}")
+            if _LATE in str(cause):
                 return WorkerError(
-                    f"one of {len(self._processes)} worker processes ({'; '.join(self._described)}) gave no answer "
-                    f"within {self._timeout_s:g} s"
+                    f"one of {number} worker processes ({'; '.join(self._described)}) gave no answer within "
+                    f"{self._timeout_s:g} s"
                 )
-            time.sleep(_LOOK_S)
         return None
-
-    def _error(self, number: int, how: str) -> WorkerError:
-        return WorkerError(f"worker process {number + 1} of {len(self._processes)} ({self._described[number]}) {how}")
 
     def kill(self) -> None:
         """End the workers whatever they do, those that are stopped, too."""
         for process in self._processes:
-            process.kill()
+            with contextlib.suppress(ValueError):  # TorchRL has closed it
+                process.kill()
         self._processes = []
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and those it was raised from or during."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
