@@ -86,10 +86,10 @@ def test_products_of_compiled_passes_are_counted() -> None:
 import numpy as np
 from learner import count_products
 counted = count_products()
-from rcdsac_trl.agent.kernels.matmul import times
+from rcdsac_trl.agent.kernels.matmul import matmul
 for size in (4, 8):
     out = np.zeros((3, 5), np.float32)
-    times(np.ones((3, size), np.float32), np.ones((size, 5), np.float32), out, False)
+    matmul(np.ones((3, size), np.float32), np.ones((size, 5), np.float32), out, False)
     print(counted(), out.min(), out.max())
 """
     found = subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, capture_output=True, text=True, check=True)

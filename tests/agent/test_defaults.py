@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.risk import PowerLaw
-from rcdsac_trl.rollout.environments import environment, team
+from rcdsac_trl.rollout.environments import environment, rollout_worker
 from rcdsac_trl.rollout.make_agent import make_policy
 from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.training.setup import make_learner
@@ -37,7 +37,7 @@ def learnt(row: str) -> dict[str, Tensor]:
     loss = learner.loss
     noise = AgentNoise(range(AGENTS))
     noise.begin(0, "exploration", 0)
-    group = team(
+    group = rollout_worker(
         settings.training_world,
         settings.algo,
         split="train",
@@ -48,7 +48,7 @@ def learnt(row: str) -> dict[str, Tensor]:
     keys = ("range", "waypoint", "velocity")
     happened = ("reward", "reward_components", "contact", "goal_reached")
     policy = make_policy(loss.actor_network, noise, "cpu")
-    episodes = group.drive(policy, 0, observed=keys, happened=happened).tensordict()
+    episodes = group.rollout(policy, 0, observed=keys, happened=happened).tensordict()
     group.close()
     learner.replay.add_episodes(episodes)
     losses = learner.update()

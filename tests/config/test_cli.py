@@ -440,7 +440,7 @@ def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -
         ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"],
         ["collector=ray", "collector.num_processes=2"],
     ],
-    ids=["workers", "teams", "validation", "ray"],
+    ids=["workers", "multi", "validation", "ray"],
 )
 def test_ctrl_c_with_processes(tmp_path: Path, processes: list[str]) -> None:
     code, err = interrupt(tmp_path, *processes)

@@ -327,7 +327,7 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             "learner.max_grad_norm=1.0",
         ).run()
     # What would start processes on other machines is told all that is chosen of them.
-    monkeypatch.setattr("rcdsac_trl.rollout.ray_workers.RayTeams", lambda *_, **__: None)
+    monkeypatch.setattr("rcdsac_trl.rollout.ray_workers.RayWorkers", lambda *_, **__: None)
     settings = tiny_settings("sac", "collector=ray", "collector.num_processes=2", "collector.address=auto")
     make_episodes(settings, make_actor(settings), "cpu", Progress())
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")

@@ -30,7 +30,7 @@ from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.rollout.metrics import METRICS
 from rcdsac_trl.rollout.navigation_metrics import TRIP_METRICS
 from rcdsac_trl.rollout.policies import LeanPolicy, PursuitPolicy
-from rcdsac_trl.rollout.worker import Driven, Team
+from rcdsac_trl.rollout.worker import EpisodeBatch, RolloutWorker
 from rcdsac_trl.storage.checkpoint import Checkpoints, load_weights
 from rcdsac_trl.storage.checkpoint_record import Progress, load_progress
 from rcdsac_trl.training.validation import Snapshot
@@ -184,12 +184,12 @@ def test_rows_and_summary_add_up(run: Path, tmp_path: Path) -> None:
 
 
 class Hits:
-    """A team whose every agent collides in its second of four steps."""
+    """A worker whose every agent collides in its second of four steps."""
 
     def __init__(self, num_agents: int) -> None:
         self.num_agents = num_agents
 
-    def drive(self, policy: TensorDictModuleBase, episode: int, **asked: Any) -> Driven:
+    def rollout(self, policy: TensorDictModuleBase, episode: int, **asked: Any) -> EpisodeBatch:
         assert (asked["observed"], asked["happened"]) == (
             ("velocity", "pose"),
             ("contact", "goal_reached", "reward_components"),
@@ -203,7 +203,7 @@ class Hits:
             "reward_components": components,
             "action": np.zeros((self.num_agents, 4, 2), np.float32),
         }
-        return Driven({"velocity": np.full((self.num_agents, 5, 4), -0.1, np.float32)}, done, {})
+        return EpisodeBatch({"velocity": np.full((self.num_agents, 5, 4), -0.1, np.float32)}, done, {})
 
 
 class Nothing(TensorDictModuleBase):
@@ -225,9 +225,11 @@ class Nothing(TensorDictModuleBase):
 @pytest.mark.parametrize("sampled", [False, True])
 def test_a_table_of_known_episodes(sampled: bool) -> None:
     conditions = [Condition(collision_weight=2.0), Condition(collision_weight=1.0)]
-    policy, team = Nothing(), Hits(4)
+    policy, worker = Nothing(), Hits(4)
     table = measurement.table_of(
-        measurement.measure_map(team, policy, conditions=conditions, num_agents=2, map_index=map_index, sampled=sampled)
+        measurement.measure_map(
+            worker, policy, conditions=conditions, num_agents=2, map_index=map_index, sampled=sampled
+        )
         for map_index in (2, 0, 1)
     )
     assert policy.kinds == {ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC}
@@ -414,14 +416,14 @@ def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> Non
 
 def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     closed: list[bool] = []
-    original: Callable[..., Team] = driver.evaluation_team
+    original: Callable[..., RolloutWorker] = driver.evaluation_worker
 
-    def watched(*arguments: Any) -> Team:
-        team = original(*arguments)
-        close = team.close
-        monkeypatch.setattr(team, "close", lambda: (closed.append(True), close()))
-        return team
+    def watched(*arguments: Any) -> RolloutWorker:
+        worker = original(*arguments)
+        close = worker.close
+        monkeypatch.setattr(worker, "close", lambda: (closed.append(True), close()))
+        return worker
 
-    monkeypatch.setattr(driver, "evaluation_team", watched)
+    monkeypatch.setattr(driver, "evaluation_worker", watched)
     evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     assert closed == [True]

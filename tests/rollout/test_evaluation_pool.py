@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rcdsac_trl.errors import FaultError, UserInputError
-from rcdsac_trl.rollout.evaluation_pool import Drive, Drivers, Rows, drive_maps
+from rcdsac_trl.rollout.evaluation_pool import Drive, EvaluationPool, Rows, evaluate_maps
 from rcdsac_trl.system.processes import WorkerError, resolve_processes, resolve_processes_beside
 
 
@@ -43,20 +43,20 @@ def endless(told: Path) -> Iterator[Drive]:
 
 
 def test_every_map_is_driven_once_and_by_a_process_of_its_own() -> None:
-    rows = [row for rows in drive_maps(counting, 7, processes=2) for row in rows]
+    rows = [row for rows in evaluate_maps(counting, 7, processes=2) for row in rows]
     assert sorted(row["map"] for row in rows) == list(range(7))
     assert os.getpid() not in {row["process"] for row in rows}
-    assert list(drive_maps(counting, 2, processes=0)) == [[{"map": i, "process": os.getpid()}] for i in range(2)]
+    assert list(evaluate_maps(counting, 2, processes=0)) == [[{"map": i, "process": os.getpid()}] for i in range(2)]
 
 
 def test_a_process_that_dies_ends_the_evaluation_and_leaves_none_behind() -> None:
     with pytest.raises(FaultError, match="exit code 7"):
-        list(drive_maps(breaking, 4, processes=2))
+        list(evaluate_maps(breaking, 4, processes=2))
     assert not multiprocessing.active_children()
 
 
 def test_processes_end_with_whoever_stops_asking() -> None:
-    maps = drive_maps(counting, 1000, processes=2)
+    maps = evaluate_maps(counting, 1000, processes=2)
     next(maps)
     assert len(multiprocessing.active_children()) == 2
     maps.close()  # as on Ctrl-C
@@ -64,7 +64,7 @@ def test_processes_end_with_whoever_stops_asking() -> None:
 
 
 def test_whoever_does_not_wait_gets_what_there_is() -> None:
-    drivers = Drivers(counting, 5, processes=2, at_once=True)
+    drivers = EvaluationPool(counting, 5, processes=2, at_once=True)
     found: list[Rows] = []
     while len(found) < 5:
         before = time.monotonic()
@@ -87,7 +87,7 @@ def wait_for(path: Path) -> int:
 
 
 def test_a_process_that_hangs_counts_as_dead(tmp_path: Path) -> None:
-    drivers = Drivers(partial(endless, tmp_path / "process"), 1, processes=1, timeout_s=0.5)
+    drivers = EvaluationPool(partial(endless, tmp_path / "process"), 1, processes=1, timeout_s=0.5)
     process = wait_for(tmp_path / "process")
     os.kill(process, signal.SIGSTOP)
     with pytest.raises(WorkerError, match=r"driving process 1 of 1 made no step within 0\.5 s"):
@@ -105,7 +105,7 @@ def test_a_process_ends_by_itself_when_the_main_one_is_killed(tmp_path: Path) ->
         "from rcdsac_trl.rollout import evaluation_pool as drivers\n"
         "from test_evaluation_pool import endless\n"
         "drivers._PRELOADED = 'test_evaluation_pool'\n"
-        "drivers.Drivers(partial(endless, Path(sys.argv[1])), 1, processes=1)\n"
+        "drivers.EvaluationPool(partial(endless, Path(sys.argv[1])), 1, processes=1)\n"
         "time.sleep(1000)\n"
     )
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from rcdsac_trl.rollout.navigation_metrics import TRIP_METRICS, trip_metrics
+from rcdsac_trl.rollout.navigation_metrics import TRIP_METRICS, navigation_metrics
 
 PERIOD_S = 0.5
 
@@ -32,7 +32,7 @@ def measure(points: list[tuple[float, float]], contact: str, goal: str) -> dict[
     pose = torch.tensor([[(x, y, 0.0) for x, y in points]])
     after = {"pose": pose[:, 1:], **flags}
     episodes = TensorDict({"pose": pose[:, :-1], "next": after}, batch_size=[1, len(points) - 1])
-    measured = trip_metrics(episodes, Room(), torch.tensor([PERIOD_S]))  # type: ignore[arg-type]
+    measured = navigation_metrics(episodes, Room(), torch.tensor([PERIOD_S]))  # type: ignore[arg-type]
     assert tuple(measured) == TRIP_METRICS
     return {key: value.item() for key, value in measured.items()}
 

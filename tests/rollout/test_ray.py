@@ -1,4 +1,4 @@
-"""Teams on a Ray cluster: the episodes of one process, whatever becomes of the cluster's.
+"""WorkerGroup on a Ray cluster: the episodes of one process, whatever becomes of the cluster's.
 
 Ray takes long to start, and each of its processes to import: what needs a cluster is slow.
 """
@@ -21,9 +21,9 @@ from killed_training import check_killed_run_is_continued
 from rcdsac_trl.config.run_config import CHECKPOINTS
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.rollout.make_agent import make_actor, packed
-from rcdsac_trl.rollout.make_collector import _team
-from rcdsac_trl.rollout.torchrl_worker import AT_REST, STEPS, TeamCollector, beside, watch
-from rcdsac_trl.rollout.worker_processes import LocalTeam, Request
+from rcdsac_trl.rollout.make_collector import _worker
+from rcdsac_trl.rollout.torchrl_worker import AT_REST, STEPS, WorkerCollector, beside, watch
+from rcdsac_trl.rollout.worker_processes import LocalWorker, RolloutRequest
 from rcdsac_trl.storage.checkpoint_record import newest
 from rcdsac_trl.system import extras
 from rcdsac_trl.training.setup import check_training
@@ -37,23 +37,23 @@ pytestmark = pytest.mark.filterwarnings(
 
 
 # ------------------------------------------------------------------------------------------------ without a cluster
-def test_a_team_as_a_collector_drives_what_it_is_asked_for() -> None:
+def test_a_worker_as_a_collector_drives_what_it_is_asked_for() -> None:
     settings = tiny_settings()
-    make = partial(_team, settings, [0, 1])
-    requests = [Request(number, 3 - number, packed(make_actor(settings))) for number in range(2)]
-    team, collector = LocalTeam(make), TeamCollector([make], worker_idx=1, frames_per_batch=7)
+    make = partial(_worker, settings, [0, 1])
+    requests = [RolloutRequest(number, 3 - number, packed(make_actor(settings))) for number in range(2)]
+    worker, collector = LocalWorker(make), WorkerCollector([make], worker_idx=1, frames_per_batch=7)
     assert collector.stats() == {STEPS: AT_REST}
     for request in requests:
         collector.prepare(request)
         assert collector.stats() == {STEPS: request.iteration * EPISODE_STEPS}
-        found, expected = collector.next(), team.ask(request)
+        found, expected = collector.next(), worker.ask(request)
         assert found.batch_size == (AGENTS, EPISODE_STEPS)
         for key in expected.keys(True, True):
             assert torch.equal(found[key], expected[key]), key
         assert collector.stats() == {STEPS: AT_REST}
     with pytest.raises(RuntimeError, match=r"^prepare\(\) says what to drive"):
         collector.next()
-    team.close()
+    worker.close()
 
 
 def test_a_process_at_rest_does_not_count_as_hung_but_one_that_neither_steps_nor_answers_does() -> None:
@@ -146,18 +146,18 @@ def remove_a_node(cluster: Any, collectors: Sequence[Any]) -> int:
 def test_a_run_goes_on_after_a_process_was_lost(
     cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lose: Callable[..., int], told: str
 ) -> None:
-    from rcdsac_trl.rollout.ray_workers import RayTeams
+    from rcdsac_trl.rollout.ray_workers import RayWorkers
 
-    ask, asked, lost = RayTeams.ask, [], []
+    ask, asked, lost = RayWorkers.ask, [], []
 
-    def losing(self: RayTeams, request: Request) -> TensorDictBase:
+    def losing(self: RayWorkers, request: RolloutRequest) -> TensorDictBase:
         asked.append(request)
         if len(asked) == 2:
             lost.append(lose(cluster, self._collector.remote_collectors))
             self._timeout_s = 5.0 if "5 s" in told else None  # they have started
         return ask(self, request)
 
-    monkeypatch.setattr(RayTeams, "ask", losing)
+    monkeypatch.setattr(RayWorkers, "ask", losing)
     run, other = tmp_path / "run", tmp_path / "other"
     tiny_trainer(run, "rcdsac_pow", *RAY, "schedule.iterations=3", "world.worker_timeout_s=600").run()
     log = (run / "train.log").read_text()
@@ -177,12 +177,12 @@ def test_a_run_goes_on_after_a_process_was_lost(
 
 @pytest.mark.slow
 def test_a_cluster_without_room_is_told(cluster: Any) -> None:
-    from rcdsac_trl.rollout.ray_workers import RayTeams
+    from rcdsac_trl.rollout.ray_workers import RayWorkers
     from rcdsac_trl.system.processes import WorkerError
 
-    makes = {f"agents {number}": partial(_team, tiny_settings(), [number]) for number in range(3)}
+    makes = {f"agents {number}": partial(_worker, tiny_settings(), [number]) for number in range(3)}
     with pytest.raises(WorkerError, match=r"^the Ray cluster had no room for 3 processes within 1 s$"):
-        RayTeams(lambda cores: makes, address=None, cores=1, timeout_s=1.0)
+        RayWorkers(lambda cores: makes, address=None, cores=1, timeout_s=1.0)
 
 
 @pytest.mark.slow
@@ -193,7 +193,7 @@ def test_a_killed_run_leaves_no_process_and_is_continued(cluster: Any, tmp_path:
 @pytest.mark.slow
 def test_a_cluster_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     ray = pytest.importorskip("ray")
-    from rcdsac_trl.rollout.ray_workers import RayTeams
+    from rcdsac_trl.rollout.ray_workers import RayWorkers
 
     def init(**given: Any) -> None:
         assert given["address"] == "nowhere:6379"
@@ -202,4 +202,4 @@ def test_a_cluster_that_is_not_there_is_told(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     monkeypatch.setattr(ray, "init", init)
     with pytest.raises(FaultError, match=r"^collector\.address=nowhere:6379: Could not find any running Ray"):
-        RayTeams(lambda cores: {}, address="nowhere:6379", cores=1, timeout_s=1.0)
+        RayWorkers(lambda cores: {}, address="nowhere:6379", cores=1, timeout_s=1.0)

@@ -1,4 +1,4 @@
-"""Teams drive what the environment and its transforms would have, whoever holds the agents; and their faults."""
+"""WorkerGroup drive what the environment and its transforms would have, whoever holds the agents; and their faults."""
 
 import contextlib
 import multiprocessing
@@ -18,12 +18,12 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.rollout.environments import environment, evaluation_team
+from rcdsac_trl.rollout.environments import environment, evaluation_worker
 from rcdsac_trl.rollout.make_agent import make_loss, make_policy
 from rcdsac_trl.rollout.make_collector import make_episodes
 from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
-from rcdsac_trl.rollout.worker import Driven, side_by_side
-from rcdsac_trl.rollout.worker_processes import Drive, Request, TeamProcesses
+from rcdsac_trl.rollout.worker import EpisodeBatch, side_by_side
+from rcdsac_trl.rollout.worker_processes import Drive, RolloutRequest, WorkerProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.world.task.env import make_env
@@ -53,7 +53,7 @@ def by_transforms(
 
 @pytest.mark.parametrize("row", ["rcdsac_pow", "rcwr", None])
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_team_drives_as_the_environment_with_its_transforms(
+def test_a_worker_drives_as_the_environment_with_its_transforms(
     row: str | None, workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
@@ -71,7 +71,7 @@ def test_a_team_drives_as_the_environment_with_its_transforms(
         noise.begin(0, "test")
         return make_policy(make_loss(settings, "cpu").actor_network, noise, "cpu")
 
-    team = evaluation_team(world, algo, conditions, "evaluation", 0, 4, memory)
+    worker = evaluation_worker(world, algo, conditions, "evaluation", 0, 4, memory)
     env = environment(
         world,
         algo,
@@ -85,13 +85,13 @@ def test_a_team_drives_as_the_environment_with_its_transforms(
     one, other = policy(), policy()
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         for episode in (3, 3, 1):
-            found = team.drive(one, episode, observed=observed, happened=HAPPENED).tensordict()
+            found = worker.rollout(one, episode, observed=observed, happened=HAPPENED).tensordict()
             expected = by_transforms(env, other, episode, observed, context)
             assert found.batch_size == expected.batch_size == (agents, STEPS)
             assert set(found.keys(True, True)) == set(expected.keys(True, True))
             for key in found.keys(True, True):
                 assert torch.equal(found[key], expected[key]), key
-    team.close()
+    worker.close()
     env.close()
 
 
@@ -137,7 +137,9 @@ def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pyt
 
 def test_episodes_are_views_of_what_was_seen() -> None:
     steps = np.arange(6.0, dtype=np.float32).reshape(1, 6, 1)
-    driven = Driven({"range": steps}, {"action": steps[:, :5], "contact": steps[:, :5]}, {"risk": np.ones((1, 1))})
+    driven = EpisodeBatch(
+        {"range": steps}, {"action": steps[:, :5], "contact": steps[:, :5]}, {"risk": np.ones((1, 1))}
+    )
     both = side_by_side([driven, driven]).tensordict()
     assert both["range"][1, :, 0].tolist() == [0, 1, 2, 3, 4]
     assert both["next", "range"][1, :, 0].tolist() == [1, 2, 3, 4, 5]
@@ -148,7 +150,7 @@ def test_episodes_are_views_of_what_was_seen() -> None:
 
 
 # ------------------------------------------------------------------------------------------------ faults
-FIRST, SECOND = (Request(iteration, map_index=0, weights=b"") for iteration in range(2))
+FIRST, SECOND = (RolloutRequest(iteration, map_index=0, weights=b"") for iteration in range(2))
 TIMEOUT_S = 5.0
 
 
@@ -156,7 +158,7 @@ TIMEOUT_S = 5.0
 def answering(seconds: float, does: str) -> Iterator[Drive]:
     """Answer the first request at once; the second one only after some time, in some way."""
 
-    def drive(request: Request, before_step: Callable[[], None]) -> Driven:
+    def drive(request: RolloutRequest, before_step: Callable[[], None]) -> EpisodeBatch:
         until = time.monotonic() + seconds * request.iteration
         while time.monotonic() < until:
             time.sleep(0.01)
@@ -166,54 +168,54 @@ def answering(seconds: float, does: str) -> Iterator[Drive]:
             os._exit(7)
         if does == "fails" and request == SECOND:
             raise ValueError("a mistake")
-        return Driven({}, {"action": np.full((1, 1, 2), os.getpid() % 1000, np.float32)}, {})
+        return EpisodeBatch({}, {"action": np.full((1, 1, 2), os.getpid() % 1000, np.float32)}, {})
 
     yield drive
 
 
 @pytest.fixture
-def processes() -> Iterator[Callable[..., TeamProcesses]]:
+def processes() -> Iterator[Callable[..., WorkerProcesses]]:
     """Start processes that have answered once: what starting takes counts for nothing here."""
-    started: list[TeamProcesses] = []
+    started: list[WorkerProcesses] = []
 
-    def start(*makes: Any) -> TeamProcesses:
-        started.append(teams := TeamProcesses(makes, [f"agents {n}" for n in range(len(makes))], None))
-        teams.ask(FIRST)
-        teams.pool._timeout_s = TIMEOUT_S
-        return teams
+    def start(*makes: Any) -> WorkerProcesses:
+        started.append(group := WorkerProcesses(makes, [f"agents {n}" for n in range(len(makes))], None))
+        group.ask(FIRST)
+        group.pool._timeout_s = TIMEOUT_S
+        return group
 
     yield start
-    for teams in started:
-        teams.close()
-        teams.close()  # once more does no harm
+    for group in started:
+        group.close()
+        group.close()  # once more does no harm
     assert not multiprocessing.active_children()
 
 
-def test_slow_processes_that_take_steps_do_not_count_as_hung(processes: Callable[..., TeamProcesses]) -> None:
-    teams = processes(*[partial(answering, TIMEOUT_S + 2.0, "steps")] * 2)
-    pids = [process.pid for process in teams.pool.processes]
-    assert teams.ask(SECOND)["action"][:, 0, 0].tolist() == [pid % 1000 for pid in pids]
+def test_slow_processes_that_take_steps_do_not_count_as_hung(processes: Callable[..., WorkerProcesses]) -> None:
+    group = processes(*[partial(answering, TIMEOUT_S + 2.0, "steps")] * 2)
+    pids = [process.pid for process in group.pool.processes]
+    assert group.ask(SECOND)["action"][:, 0, 0].tolist() == [pid % 1000 for pid in pids]
 
 
 @pytest.mark.parametrize(
     ("does", "told"),
     [("ends", "ended with exit code 7"), ("fails", "ended with exit code 1"), ("sleeps", "made no step within 5 s")],
 )
-def test_a_process_that_fails_is_named(processes: Callable[..., TeamProcesses], does: str, told: str) -> None:
+def test_a_process_that_fails_is_named(processes: Callable[..., WorkerProcesses], does: str, told: str) -> None:
     slow = 1000.0 if does == "sleeps" else 0.0
-    teams = processes(partial(answering, 0.0, "steps"), partial(answering, slow, does))
+    group = processes(partial(answering, 0.0, "steps"), partial(answering, slow, does))
     with pytest.raises(WorkerError, match=rf"^worker process 2 of 2 \(agents 1\) {told}$"):
-        teams.ask(SECOND)
+        group.ask(SECOND)
 
 
 @pytest.mark.parametrize(
     ("number", "told"), [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "made no step within 5 s")]
 )
 def test_a_process_that_cannot_even_be_asked_is_named(
-    processes: Callable[..., TeamProcesses], number: signal.Signals, told: str
+    processes: Callable[..., WorkerProcesses], number: signal.Signals, told: str
 ) -> None:
-    teams = processes(*[partial(answering, 0.0, "steps")] * 2)
-    os.kill(teams.pool.processes[0].pid, number)
+    group = processes(*[partial(answering, 0.0, "steps")] * 2)
+    os.kill(group.pool.processes[0].pid, number)
     large = SECOND._replace(weights=bytes(10_000_000))  # more than a pipe holds
     with pytest.raises(WorkerError, match=rf"^worker process 1 of 2 \(agents 0\) {told}$"):
-        teams.ask(large)
+        group.ask(large)

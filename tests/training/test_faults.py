@@ -26,7 +26,7 @@ from rcdsac_trl.config.run_config import CHECKPOINTS
 from rcdsac_trl.errors import TrainingError, UserInputError
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout.policies import CollectionPolicy
-from rcdsac_trl.rollout.worker_processes import Request, TeamProcesses
+from rcdsac_trl.rollout.worker_processes import RolloutRequest, WorkerProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress, newest
 from rcdsac_trl.system import resources
 from rcdsac_trl.training.setup import resume_training
@@ -87,17 +87,17 @@ def test_a_run_goes_on_after_a_worker_was_killed(tmp_path: Path, signalled: Call
     )
 
 
-def test_a_run_goes_on_after_a_team_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_goes_on_after_a_collecting_process_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rcdsac_trl.system.process_pool.START_METHOD", "fork")  # starts at once
-    ask, asked = TeamProcesses.ask, [0]
+    ask, asked = WorkerProcesses.ask, [0]
 
-    def killing(self: TeamProcesses, request: Request) -> TensorDictBase:
+    def killing(self: WorkerProcesses, request: RolloutRequest) -> TensorDictBase:
         asked[0] += 1
         if asked[0] == 2:
             os.kill(self.pool.processes[1].pid, signal.SIGKILL)
         return ask(self, request)
 
-    monkeypatch.setattr(TeamProcesses, "ask", killing)
+    monkeypatch.setattr(WorkerProcesses, "ask", killing)
     run = tmp_path / "run"
     tiny_trainer(run, "rcdsac_pow", "collector.num_processes=2", "schedule.iterations=3").run()
     told = "iteration 1, training map 1: worker process 2 of 2 (split train, seed 0, agents 1) was killed by SIGKILL"

@@ -19,7 +19,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.rollout.env_workers import EnvWorkers
-from rcdsac_trl.rollout.episode_collectors import CollectorEpisodes
+from rcdsac_trl.rollout.episode_collectors import TorchRLEpisodeCollector
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.metrics import METRICS
 from rcdsac_trl.storage.checkpoint import load_weights
@@ -210,7 +210,7 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
     return Trainer(
         schedule=layout,
         progress=parts["progress"],
-        episodes=CollectorEpisodes(
+        episodes=TorchRLEpisodeCollector(
             lambda iteration, map_index: Collector(events, iteration, map_index),  # type: ignore[arg-type,return-value]
             lambda iteration: events.append(("iteration", iteration)),
             iteration=parts["progress"].iterations,
@@ -671,7 +671,7 @@ def test_workers_do_not_change_a_run(
     """Workers in this process: the same code with the same shapes, without the time that processes take."""
     monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
     trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "collector=parallel_env", f"world.num_workers={workers}")
-    assert isinstance(trainer.episodes, CollectorEpisodes)
+    assert isinstance(trainer.episodes, TorchRLEpisodeCollector)
     assert trainer.episodes._collector is not None
     assert trainer.episodes._collector.env.batch_size == torch.Size([workers, AGENTS // workers])
     trainer.run()
@@ -805,7 +805,7 @@ def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: P
         for key in ("range", "waypoint", "velocity"):
             assert torch.equal(batch[key][:, 0], start[key]), key
         fresh.close()
-        if collector == "single":  # else nobody asks: an episode is what a team drives
+        if collector == "single":  # else nobody asks: an episode is what a worker drives
             # Nobody terminates, and only the time limit truncates.
             assert not batch["next", "terminated"].any()
             assert batch["next", "truncated"].squeeze(-1).tolist() == [[False] * (STEPS - 1) + [True]] * AGENTS

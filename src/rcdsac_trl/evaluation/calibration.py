@@ -18,7 +18,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import measure_states
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.rollout.environments import environment
-from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, drive_maps
+from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
 from rcdsac_trl.rollout.make_agent import make_loss, packed_loss, unpacked_loss
 from rcdsac_trl.seeding import stream, torch_stream
 from rcdsac_trl.storage.checkpoint import load_weights
@@ -62,7 +62,7 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         for damaged in load_weights(checkpoints, settings.checkpoint, loss=loss):
             print(f"rcdsac_trl: {damaged}", file=sys.stderr)
         make = partial(_driver, settings, trained, conditions, packed_loss(loss))
-        return drive_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
+        return evaluate_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
 
     return MeasuredRun(
         kind="calibration",

@@ -18,9 +18,9 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
-from rcdsac_trl.rollout.evaluation_pool import Rows, drive_maps
+from rcdsac_trl.rollout.evaluation_pool import Rows, evaluate_maps
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, packed, packed_loss
-from rcdsac_trl.rollout.map_evaluator import Agent, Course, driver
+from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
 from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS, table_of
 from rcdsac_trl.rollout.metrics import summarise
 from rcdsac_trl.rollout.planners.baselines import PURSUIT, check_baseline, settings_of
@@ -46,11 +46,11 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     if settings.record:
         check_extra()
     trained = _trained(settings)
-    course = _course(settings, trained)
+    spec = _spec(settings, trained)
     if settings.baseline is not None:
-        check_baseline(settings.baseline, course.world.sensor)
+        check_baseline(settings.baseline, spec.world.sensor)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
-    simulations = max(1, processes) * course.world.num_agents
+    simulations = max(1, processes) * spec.world.num_agents
     remedy = "lower num_episodes or num_workers, or end other programs"
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
     if settings.run is not None:
@@ -61,17 +61,17 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
         return None if settings.run is None else _read_agent(trained, Path(settings.run), settings.checkpoint)
 
     def maps() -> Generator[Rows, None, None]:
-        make = partial(driver, course, *(agent() or (None,)))
-        return drive_maps(make, settings.num_maps, processes)
+        make = partial(map_evaluator, spec, *(agent() or (None,)))
+        return evaluate_maps(make, settings.num_maps, processes)
 
     def film(folder: Path, rows: Rows) -> list[Path]:
-        headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in course.conditions]
-        return write_film(course, agent(), settings.video, headings, folder)
+        headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in spec.conditions]
+        return write_film(spec, agent(), settings.video, headings, folder)
 
     return MeasuredRun(
         kind="evaluation",
-        out=Path(settings.out) if settings.out is not None else _default_out(settings, course),
-        described=_described(settings, course),
+        out=Path(settings.out) if settings.out is not None else _default_out(settings, spec),
+        described=_described(settings, spec),
         unit="map",
         num_units=settings.num_maps,
         measure=maps,
@@ -80,13 +80,13 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     )
 
 
-def _course(settings: EvaluationSettings, trained: TrainingSettings) -> Course:
+def _spec(settings: EvaluationSettings, trained: TrainingSettings) -> EvaluationSpec:
     conditions = [Condition()]
     if settings.run is not None:
         conditions = trained.algo.conditions(settings.beta, settings.collision_weight)
     controllers = settings.beta_controller or ()
     conditions += [Condition(controller=name) for name in controllers]
-    return Course(
+    return EvaluationSpec(
         trained=trained,
         world=_evaluation_world(settings, trained, len(conditions)),
         conditions=conditions,
@@ -107,21 +107,21 @@ def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
     return trained.algo.name if settings.baseline is None else settings.baseline
 
 
-def _default_out(settings: EvaluationSettings, course: Course) -> Path:
+def _default_out(settings: EvaluationSettings, spec: EvaluationSpec) -> Path:
     name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
     if settings.run is None:
-        return Path("evaluation") / f"{settings.baseline}-{course.world.sensor}-{name}".replace(":", "-")
-    contexts = "".join(f"-{condition}".replace("=", "_") for condition in course.conditions)
+        return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
+    contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
     return Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{contexts}"
 
 
-def _described(settings: EvaluationSettings, course: Course) -> dict[str, Any]:
+def _described(settings: EvaluationSettings, spec: EvaluationSpec) -> dict[str, Any]:
     """Say what is measured and how."""
-    trained, is_run = course.trained, settings.run is not None
+    trained, is_run = spec.trained, settings.run is not None
     described = {
         "agent": _name(settings, trained),
         "measure": trained.algo.distortion.name if is_run else None,
-        "sensor": course.world.sensor,
+        "sensor": spec.world.sensor,
         "train_seed": trained.seed if is_run else None,
         "checkpoint": settings.checkpoint if is_run else None,
         "split": settings.split,
@@ -129,13 +129,13 @@ def _described(settings: EvaluationSettings, course: Course) -> dict[str, Any]:
         "num_maps": settings.num_maps,
         "num_episodes": settings.num_episodes,
         "sampled": settings.sampled,
-        "conditions": [str(condition) for condition in course.conditions],
-        "map": asdict(course.world.map_settings),
-        "task": asdict(course.world.task),
+        "conditions": [str(condition) for condition in spec.conditions],
+        "map": asdict(spec.world.map_settings),
+        "task": asdict(spec.world.task),
         "commit": commit(),
     }
-    if course.controller is not None:
-        described["controller"] = asdict(course.controller)
+    if spec.controller is not None:
+        described["controller"] = asdict(spec.controller)
     return described if settings.baseline is None else described | settings_of(settings.baseline)
 
 

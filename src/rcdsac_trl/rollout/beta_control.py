@@ -1,4 +1,4 @@
-"""Beta that is turned at run time, in an evaluation: the same controllers as on a robot, for a whole team."""
+"""Beta that is turned at run time, in an evaluation: the same controllers as on a robot, for a whole worker."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,7 @@ class AdaptivePolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `risk`, and what the policy writes."""
-        # A team begins its episodes together.
+        # A worker begins its episodes together.
         if tensordict["is_init"].all():
             self.told, self._quantiles = [], {}
             for controller in self.controllers:

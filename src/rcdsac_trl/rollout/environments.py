@@ -1,4 +1,4 @@
-"""Environments and teams with everything a policy reads."""
+"""Environments and workers with everything a policy reads."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from rcdsac_trl.agent.actor import recurrent_state_primer
 from rcdsac_trl.agent.transforms import EpisodeSampler
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.rollout.worker import Team
+from rcdsac_trl.rollout.worker import RolloutWorker
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.task.env import NavigationEnv, make_env
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -60,7 +60,7 @@ def environment(
     return env
 
 
-def team(
+def rollout_worker(
     world: WorldSettings,
     algo: AlgoSettings | None,
     *,
@@ -69,7 +69,7 @@ def team(
     agent_ids: Sequence[int],
     memory: int,
     conditions: Sequence[Condition] | None = None,
-) -> Team:
+) -> RolloutWorker:
     """Make agents of this process that drive whole episodes; arguments as for :func:`environment`."""
     env = NavigationEnv(
         world.map_settings,
@@ -82,7 +82,7 @@ def team(
         gui=world.gui,
     )
     told = _told(algo, seed, agent_ids, conditions, 0)
-    return Team(env, told, memory=memory, steps=world.task.episode_steps)
+    return RolloutWorker(env, told, memory=memory, steps=world.task.episode_steps)
 
 
 def _is_weighted(algo: AlgoSettings | None) -> bool:
@@ -126,7 +126,7 @@ def _told(
     )
 
 
-def evaluation_team(
+def evaluation_worker(
     world: WorldSettings,
     algo: AlgoSettings | None,
     conditions: Sequence[Condition],
@@ -134,9 +134,9 @@ def evaluation_team(
     seed: int,
     num_agents: int,
     memory: int,
-) -> Team:
-    """Make a team in which a block of agents drives under each condition, side by side on the same map."""
-    return team(
+) -> RolloutWorker:
+    """Make a worker in which a block of agents drives under each condition, side by side on the same map."""
+    return rollout_worker(
         world,
         algo,
         split=split,

@@ -9,11 +9,11 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
 from rcdsac_trl.rollout.env_workers import EnvWorkers
-from rcdsac_trl.rollout.worker_processes import Request, Teams
+from rcdsac_trl.rollout.worker_processes import RolloutRequest, WorkerGroup
 from rcdsac_trl.system.processes import WorkerError
 
 
-class Episodes(Protocol):
+class EpisodeCollector(Protocol):
     """Collects the episodes of one iteration after another."""
 
     def collect(self, iteration: int, map_index: int) -> TensorDictBase:
@@ -31,37 +31,37 @@ class Episodes(Protocol):
         """End the worker processes, and bear that they may be gone: it must not hide why training ends."""
 
 
-class TeamEpisodes:
-    """Has whole episodes driven by teams, each with a copy of the actor that comes with every request.
+class WorkerEpisodeCollector:
+    """Has whole episodes driven by group, each with a copy of the actor that comes with every request.
 
     Args:
-        make: makes the teams.
+        make: makes the group.
         weights: packs the actor's weights as they are now.
     """
 
-    def __init__(self, make: Callable[[], Teams], weights: Callable[[], bytes]) -> None:
+    def __init__(self, make: Callable[[], WorkerGroup], weights: Callable[[], bytes]) -> None:
         self._make = make
         self._weights = weights
-        self._teams: Teams | None = make()
+        self._group: WorkerGroup | None = make()
 
     def collect(self, iteration: int, map_index: int) -> TensorDictBase:
-        """See :class:`Episodes`."""
+        """See :class:`EpisodeCollector`."""
         try:
-            if self._teams is None:
-                self._teams = self._make()
-            return self._teams.ask(Request(iteration, map_index, self._weights()))
+            if self._group is None:
+                self._group = self._make()
+            return self._group.ask(RolloutRequest(iteration, map_index, self._weights()))
         except WorkerError:
             self.close()
             raise
 
     def close(self) -> None:
-        """See :class:`Episodes`."""
-        if self._teams is not None:
-            self._teams.close()
-        self._teams = None
+        """See :class:`EpisodeCollector`."""
+        if self._group is not None:
+            self._group.close()
+        self._group = None
 
 
-class CollectorEpisodes:
+class TorchRLEpisodeCollector:
     """Takes the episodes from one of TorchRL's collectors.
 
     Args:
@@ -90,7 +90,7 @@ class CollectorEpisodes:
         self._start(iteration, map_index)
 
     def collect(self, iteration: int, map_index: int) -> TensorDictBase:
-        """See :class:`Episodes`."""
+        """See :class:`EpisodeCollector`."""
         try:
             if self._collector is None:
                 self._start(iteration, map_index)
@@ -115,7 +115,7 @@ class CollectorEpisodes:
         self._batches = iter(self._collector)
 
     def close(self) -> None:
-        """See :class:`Episodes`."""
+        """See :class:`EpisodeCollector`."""
         threads = torch.get_num_threads()
         if self._collector is not None:
             with contextlib.suppress(Exception):

@@ -1,6 +1,6 @@
 """Maps over processes: each drives whole maps by itself, so that none waits for another within a map.
 
-An evaluation waits for them (:func:`drive_maps`), a training goes on meanwhile (:class:`Drivers`).
+An evaluation waits for them (:func:`evaluate_maps`), a training goes on meanwhile (:class:`EvaluationPool`).
 """
 
 import contextlib
@@ -26,7 +26,7 @@ def prepare() -> None:
     process_pool.prepare(_PRELOADED)
 
 
-class Drivers:
+class EvaluationPool:
     """Processes that drive maps 0, 1, ..., while this one does something else.
 
     A map's rows follow from its number alone, so they are the same for any number of processes.
@@ -85,7 +85,7 @@ class Drivers:
         self._pool.close()
 
 
-def drive_maps(
+def evaluate_maps(
     make: Callable[[], AbstractContextManager[Drive]], num_maps: int, processes: int
 ) -> Generator[Rows, None, None]:
     """Drive maps 0, 1, ... and yield the rows of each as it is done, in any order.
@@ -102,7 +102,7 @@ def drive_maps(
         with make() as drive:
             yield from (drive(map_index, interruption_point) for map_index in range(num_maps))
         return
-    with contextlib.closing(Drivers(make, num_maps, processes)) as drivers:
+    with contextlib.closing(EvaluationPool(make, num_maps, processes)) as drivers:
         try:
             yield from drivers.receive(until_done=True)
         except WorkerError as error:

@@ -13,12 +13,19 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.rollout.env_workers import EnvWorkers
-from rcdsac_trl.rollout.environments import environment, team
-from rcdsac_trl.rollout.episode_collectors import CollectorEpisodes, Episodes, TeamEpisodes
+from rcdsac_trl.rollout.environments import environment, rollout_worker
+from rcdsac_trl.rollout.episode_collectors import EpisodeCollector, TorchRLEpisodeCollector, WorkerEpisodeCollector
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, packed
 from rcdsac_trl.rollout.policies import AgentNoise, CollectionPolicy
-from rcdsac_trl.rollout.worker import Driven
-from rcdsac_trl.rollout.worker_processes import Drive, LocalTeam, MakeDrive, Request, TeamProcesses, Teams
+from rcdsac_trl.rollout.worker import EpisodeBatch
+from rcdsac_trl.rollout.worker_processes import (
+    Drive,
+    LocalWorker,
+    MakeDrive,
+    RolloutRequest,
+    WorkerGroup,
+    WorkerProcesses,
+)
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.extras import needs
@@ -31,7 +38,9 @@ SPLIT: Split = "train"
 _HAPPENED = ("contact", "goal_reached", "reward_components")
 
 
-def make_episodes(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
+def make_episodes(
+    settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress
+) -> EpisodeCollector:
     """Make what collects the episodes of each iteration.
 
     Args:
@@ -53,23 +62,25 @@ def check_collector(settings: TrainingSettings) -> None:
         needs("ray", "collector=ray", extra="ray", instead="collector=multi")
 
 
-def _multi(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
+def _multi(
+    settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress
+) -> EpisodeCollector:
     """Share the agents out over processes; they drive on the CPU, wherever the learner is."""
     given = settings.world
     processes = resolve_processes(settings.collector.num_processes, given.num_agents, "collector.num_processes")
 
-    def teams() -> Teams:
+    def group() -> WorkerGroup:
         if processes == 0:
-            return LocalTeam(partial(_team, settings, range(given.num_agents)))
+            return LocalWorker(partial(_worker, settings, range(given.num_agents)))
         shares = _shares(settings, processes)
-        return TeamProcesses(list(shares.values()), list(shares), given.worker_timeout_s)
+        return WorkerProcesses(list(shares.values()), list(shares), given.worker_timeout_s)
 
-    return TeamEpisodes(teams, lambda: packed(actor))
+    return WorkerEpisodeCollector(group, lambda: packed(actor))
 
 
-def _ray(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
+def _ray(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> EpisodeCollector:
     """Share the agents out over processes of a Ray cluster; they drive on the CPU, wherever the learner is."""
-    from rcdsac_trl.rollout.ray_workers import RayTeams  # imports Ray, which takes long and may not be there
+    from rcdsac_trl.rollout.ray_workers import RayWorkers  # imports Ray, which takes long and may not be there
 
     given, number = settings.world, settings.collector.num_processes
     cores = usable_cores() if number == "auto" else max(number, usable_cores())
@@ -77,25 +88,25 @@ def _ray(settings: TrainingSettings, actor: TensorDictSequential, device: str, p
     def shares(cores_of_cluster: int) -> dict[str, MakeDrive]:
         return _shares(settings, largest_divisor(given.num_agents, cores_of_cluster) if number == "auto" else number)
 
-    def teams() -> Teams:
-        return RayTeams(shares, address=settings.collector.address, cores=cores, timeout_s=given.worker_timeout_s)
+    def group() -> WorkerGroup:
+        return RayWorkers(shares, address=settings.collector.address, cores=cores, timeout_s=given.worker_timeout_s)
 
-    return TeamEpisodes(teams, lambda: packed(actor))
+    return WorkerEpisodeCollector(group, lambda: packed(actor))
 
 
 def _shares(settings: TrainingSettings, processes: int) -> dict[str, MakeDrive]:
-    """Share the agents out; return what makes each team, by what describes it."""
+    """Share the agents out; return what makes each worker, by what describes it."""
     parts = [part.tolist() for part in np.array_split(np.arange(settings.world.num_agents), processes)]
     return {
-        f"split {SPLIT}, seed {settings.seed}, agents {', '.join(map(str, ids))}": partial(_team, settings, ids)
+        f"split {SPLIT}, seed {settings.seed}, agents {', '.join(map(str, ids))}": partial(_worker, settings, ids)
         for ids in parts
     }
 
 
 @contextlib.contextmanager
-def _team(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Drive]:
+def _worker(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Drive]:
     """Make what drives some of the agents, in this process."""
-    agents = team(
+    agents = rollout_worker(
         settings.training_world,
         settings.algo,
         split=SPLIT,
@@ -106,11 +117,11 @@ def _team(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Driv
     actor = make_actor(settings)
     policy = _collection_policy(settings, partial(make_policy, actor, device="cpu"), agent_ids)
 
-    def drive(request: Request, before_step: Callable[[], None]) -> Driven:
+    def drive(request: RolloutRequest, before_step: Callable[[], None]) -> EpisodeBatch:
         actor.load_state_dict(safetensors.torch.load(request.weights))
         policy.set_iteration(request.iteration)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            return agents.drive(
+            return agents.rollout(
                 policy,
                 request.map_index,
                 observed=AGENT_OBSERVATIONS,
@@ -124,7 +135,9 @@ def _team(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Driv
         agents.close()
 
 
-def _by_torchrl(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
+def _by_torchrl(
+    settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress
+) -> EpisodeCollector:
     """Let TorchRL's own collector drive in this process, over the workers of a ``ParallelEnv`` where there are any."""
     world, schedule = settings.training_world, settings.schedule
     agent_ids = range(world.num_agents)
@@ -154,7 +167,7 @@ def _by_torchrl(settings: TrainingSettings, actor: TensorDictSequential, device:
     done = progress.iterations
     workers = resolve_num_workers(world.num_workers, world.num_agents)
     described = list(_shares(settings, workers)) if workers else []
-    return CollectorEpisodes(
+    return TorchRLEpisodeCollector(
         collector,
         policy.set_iteration,
         iteration=done,

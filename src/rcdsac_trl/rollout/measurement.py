@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.rollout.evaluation_pool import Rows
 from rcdsac_trl.rollout.metrics import episode_metrics
-from rcdsac_trl.rollout.worker import Team
+from rcdsac_trl.rollout.worker import RolloutWorker
 from rcdsac_trl.system.interrupts import interruption_point
 
 # What an episode's row needs; everything else of a step is dropped at once.
@@ -28,7 +28,7 @@ CONDITION_COLUMNS = ("beta", "collision_weight", "beta_controller")
 
 
 def measure_map(
-    team: Team,
+    worker: RolloutWorker,
     policy: TensorDictModuleBase,
     *,
     conditions: Sequence[Condition],
@@ -42,10 +42,10 @@ def measure_map(
     """Measure a policy on one map.
 
     Args:
-        team: ``len(conditions) * num_agents`` agents, condition after condition; agent i of every condition meets the
+        worker: ``len(conditions) * num_agents`` agents, condition after condition; agent i of every condition meets the
             same map, start and goals.
         policy: writes `action`.
-        conditions: what the agents of each block are told (the team tells them; here it labels rows).
+        conditions: what the agents of each block are told (the worker tells them; here it labels rows).
         num_agents: episodes a map and a condition.
         map_index: number of the map and its episode.
         sampled: draw actions instead of taking tanh(mean).
@@ -59,7 +59,7 @@ def measure_map(
     """
     kind = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
-        driven = team.drive(policy, map_index, observed=_OBSERVED, happened=_HAPPENED, before_step=before_step)
+        driven = worker.rollout(policy, map_index, observed=_OBSERVED, happened=_HAPPENED, before_step=before_step)
     episodes = driven.tensordict()
     measured = episode_metrics(episodes) | ({} if more is None else more(episodes))
     rows = []

@@ -25,7 +25,7 @@ TRIP_METRICS = (
 _CLEARANCE_LIMIT_M = 3.0
 
 
-def trip_metrics(episodes: TensorDictBase, planner: Planner, period_s: Tensor) -> dict[str, Tensor]:
+def navigation_metrics(episodes: TensorDictBase, planner: Planner, period_s: Tensor) -> dict[str, Tensor]:
     """Measure the ways of episodes on one map.
 
     The first goal is one trial, as in BARN and CrowdNav: a success reached it without touching anything, a collision

@@ -15,7 +15,7 @@ NUM_QUANTILES = 16
 
 
 class QuantilePredictor:
-    """Predicts the return of some agents of a team as a robot does: the critics look back to the episode's start, and
+    """Predicts the return of some agents of a worker as a robot does: the critics look back to the episode's start, and
     the lower one counts at each fraction.
 
     Args:

@@ -1,4 +1,4 @@
-"""Teams on the machines of a Ray cluster, held by TorchRL's ``RayCollector``.
+"""WorkerGroup on the machines of a Ray cluster, held by TorchRL's ``RayCollector``.
 
 Import this module only where Ray is wanted: it takes seconds.
 """
@@ -19,8 +19,8 @@ from tensordict import TensorDictBase
 from torchrl.collectors.distributed import RayCollector
 
 from rcdsac_trl.errors import FaultError, first_line
-from rcdsac_trl.rollout.torchrl_worker import STEPS, TeamCollector, beside, watch
-from rcdsac_trl.rollout.worker_processes import MakeDrive, Request
+from rcdsac_trl.rollout.torchrl_worker import STEPS, WorkerCollector, beside, watch
+from rcdsac_trl.rollout.worker_processes import MakeDrive, RolloutRequest
 from rcdsac_trl.system.interrupts import interruption_point
 from rcdsac_trl.system.processes import WorkerError
 
@@ -32,16 +32,16 @@ _ANSWER_S = 2.0
 _NOTICE_S = 10.0
 
 
-class RayTeams:
-    """A process of a Ray cluster for each team. Nothing but :meth:`close` works after an error.
+class RayWorkers:
+    """A process of a Ray cluster for each worker. Nothing but :meth:`close` works after an error.
 
     Weights go through Ray's store of objects, once to each machine. TorchRL's ``RayWeightSyncScheme`` opens connections
     of its own beside Ray's, to the address that a machine's name has on that machine, which often is its own loopback.
 
     Args:
-        teams: makes, of the number of the cluster's cores, what makes each team's drive, by what describes the team in
-            messages; teams are of one size, and what makes them must pickle.
-        address: of the cluster, as ``ray.init`` takes it; None makes one of this machine alone, for these teams.
+        group: makes, of the number of the cluster's cores, what makes each worker's drive, by what describes the worker
+            in messages; workers are of one size, and what makes them must pickle.
+        address: of the cluster, as ``ray.init`` takes it; None makes one of this machine alone, for these workers.
         cores: that a cluster of this machine alone has.
         timeout_s: seconds in which a process must find room in the cluster, be ready, and take a step, else it counts
             as lost; None: it never does.
@@ -53,7 +53,7 @@ class RayTeams:
 
     def __init__(
         self,
-        teams: Callable[[int], Mapping[str, MakeDrive]],
+        group: Callable[[int], Mapping[str, MakeDrive]],
         *,
         address: str | None,
         cores: int,
@@ -63,7 +63,7 @@ class RayTeams:
         self._waiting: Future[TensorDictBase] | None = None
         self._stack = contextlib.ExitStack()
         try:
-            makes = teams(self._stack.enter_context(_connected(address, cores)))
+            makes = group(self._stack.enter_context(_connected(address, cores)))
             self._described = list(makes)
             self._stack.callback(self._let_notice)
             room = placement_group([{"CPU": 1}] * len(makes), strategy="SPREAD")
@@ -85,8 +85,8 @@ class RayTeams:
                     f"the Ray cluster had no room for {len(self._described)} processes within {self._timeout_s:g} s"
                 )
 
-    def ask(self, request: Request) -> TensorDictBase:
-        """See :class:`~rcdsac_trl.rollout.worker_processes.Teams`.
+    def ask(self, request: RolloutRequest) -> TensorDictBase:
+        """See :class:`~rcdsac_trl.rollout.worker_processes.WorkerGroup`.
 
         Raises:
             WorkerError: if a process dies or hangs, or its machine is lost.
@@ -100,7 +100,7 @@ class RayTeams:
         except RayError as error:
             raise WorkerError(self._told(error)) from error
 
-    def _collect(self, request: Request) -> TensorDictBase:
+    def _collect(self, request: RolloutRequest) -> TensorDictBase:
         stored = ray.put(request)
         self._collector.map_fn("prepare", [(stored,)] * len(self._described))
         with warnings.catch_warnings():
@@ -130,7 +130,7 @@ class RayTeams:
             wait([self._waiting], timeout=_NOTICE_S)
 
     def close(self) -> None:
-        """See :class:`~rcdsac_trl.rollout.worker_processes.Teams`."""
+        """See :class:`~rcdsac_trl.rollout.worker_processes.WorkerGroup`."""
         with contextlib.suppress(Exception):  # whatever the cluster is by now
             self._stack.close()
 
@@ -165,8 +165,8 @@ def _collector(makes: Sequence[MakeDrive], room: PlacementGroup) -> RayCollector
         warnings.filterwarnings("ignore", "The policy is not an nn.Module", UserWarning)  # weights come with a request
         return RayCollector(
             list(makes),
-            collector_class=TeamCollector,
-            # Teams drive what they are asked for: nobody counts frames.
+            collector_class=WorkerCollector,
+            # WorkerGroup drive what they are asked for: nobody counts frames.
             frames_per_batch=len(makes),
             total_frames=sys.maxsize,
             remote_configs=remotes,

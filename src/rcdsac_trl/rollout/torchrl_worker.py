@@ -1,4 +1,4 @@
-"""A team as one of TorchRL's collectors, so that TorchRL's distributed collectors can hold it on another machine.
+"""A worker as one of TorchRL's collectors, so that TorchRL's distributed collectors can hold it on another machine.
 
 Those collectors wait where Ctrl-C does not reach them, and for ever. So they wait in a thread (:func:`beside`), and the
 main one looks on (:func:`watch`).
@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors._base import BaseCollector
 
-from rcdsac_trl.rollout.worker_processes import MakeDrive, Request
+from rcdsac_trl.rollout.worker_processes import MakeDrive, RolloutRequest
 from rcdsac_trl.system.interrupts import interruption_point
 
 T = TypeVar("T")
@@ -27,19 +27,19 @@ _LOOK_S = 0.25
 _ASK_EVERY_S = 2.0
 
 STEPS = "steps"
-"""Key of the number of steps in :meth:`TeamCollector.stats`."""
+"""Key of the number of steps in :meth:`WorkerCollector.stats`."""
 AT_REST = math.inf
 """The number of steps of who has nothing to do."""
 
 
-class TeamCollector(BaseCollector):
+class WorkerCollector(BaseCollector):
     """Collects the episodes that it is asked for, with the weights that come with the request.
 
-    TorchRL's own ``Collector`` decides by itself what comes next, and takes three times as long as a team. What has
+    TorchRL's own ``Collector`` decides by itself what comes next, and takes three times as long as a worker. What has
     happened leaves nothing behind: an episode follows from the request alone.
 
     Args:
-        create_env_fn: what makes the team's drive, alone in a list, as TorchRL passes it on.
+        create_env_fn: what makes the worker's drive, alone in a list, as TorchRL passes it on.
         worker_idx: which of the collectors this is.
         settings: what TorchRL passes on to collectors that step an environment; there is none here.
     """
@@ -50,11 +50,11 @@ class TeamCollector(BaseCollector):
         self.worker_idx = worker_idx
         self._stack = contextlib.ExitStack()
         self._drive = self._stack.enter_context(create_env_fn[0]())
-        self._request: Request | None = None
+        self._request: RolloutRequest | None = None
         self._steps = 0.0
         self._shown = AT_REST
 
-    def prepare(self, request: Request) -> None:
+    def prepare(self, request: RolloutRequest) -> None:
         """Say what the next batch is to be."""
         self._request = request
         self._shown = self._steps

@@ -1,7 +1,7 @@
-"""Teams: agents that drive whole episodes side by side on one map.
+"""WorkerGroup: agents that drive whole episodes side by side on one map.
 
 TorchRL's collector, its transforms and the tensordicts of every step cost a few agents more than driving them does. A
-team therefore steps the environment's own arrays, and writes what is asked for into arrays of the whole episode. The
+worker therefore steps the environment's own arrays, and writes what is asked for into arrays of the whole episode. The
 numbers are, bit by bit, those of the environment with its transforms.
 """
 
@@ -21,18 +21,18 @@ from rcdsac_trl.world.task.env import COLLISION_WEIGHT, NavigationEnv
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, AGENT_OBSERVATIONS
 
 
-class Driven(NamedTuple):
+class EpisodeBatch(NamedTuple):
     """Whole episodes of N agents, T steps each; plain arrays, so that they go from process to process.
 
     Attributes:
         observed: what is known before and after each step, ``[N, T + 1, ..]``.
         done: what was done in each step and what came of it, ``[N, T, ..]``.
-        told: what holds for the whole episode, ``[N, 1]``.
+        context: what holds for the whole episode, ``[N, 1]``.
     """
 
     observed: dict[str, NDArray]
     done: dict[str, NDArray]
-    told: dict[str, NDArray]
+    context: dict[str, NDArray]
 
     def tensordict(self) -> TensorDict:
         """Return the episodes as a collector does, ``[N, T]``; nothing is copied."""
@@ -42,17 +42,19 @@ class Driven(NamedTuple):
         after = {key: value[:, 1:] for key, value in observed.items()}
         after |= {key: torch.from_numpy(value) for key, value in self.done.items() if key != "action"}
         before = {key: value[:, :-1] for key, value in observed.items()}
-        told = {key: torch.from_numpy(value).unsqueeze(1).expand(-1, steps, -1) for key, value in self.told.items()}
-        return TensorDict({**before, **told, "action": action, "next": after}, batch_size=[number, steps])
+        context = {
+            key: torch.from_numpy(value).unsqueeze(1).expand(-1, steps, -1) for key, value in self.context.items()
+        }
+        return TensorDict({**before, **context, "action": action, "next": after}, batch_size=[number, steps])
 
 
-def side_by_side(parts: Sequence[Driven]) -> Driven:
-    """Put the agents of several teams together, in their order."""
+def side_by_side(parts: Sequence[EpisodeBatch]) -> EpisodeBatch:
+    """Put the agents of several workers together, in their order."""
     groups = zip(*parts, strict=True)
-    return Driven(*({key: np.concatenate([part[key] for part in group]) for key in group[0]} for group in groups))
+    return EpisodeBatch(*({key: np.concatenate([part[key] for part in group]) for key in group[0]} for group in groups))
 
 
-class Team:
+class RolloutWorker:
     """The agents of one :class:`NavigationEnv`, without a transform or a new tensordict at any step.
 
     Args:
@@ -68,7 +70,7 @@ class Team:
         self.memory = memory
         self.steps = steps
 
-    def drive(
+    def rollout(
         self,
         policy: TensorDictModuleBase,
         episode: int,
@@ -76,7 +78,7 @@ class Team:
         observed: Sequence[str],
         happened: Sequence[str],
         before_step: Callable[[], None] = interruption_point,
-    ) -> Driven:
+    ) -> EpisodeBatch:
         """Drive one episode with every agent.
 
         Args:
@@ -89,14 +91,14 @@ class Team:
         agents, number = self.env.agents, len(self.env.agents)
         agents.reset(range(number), episode)
         written = dict(agents.buffers.items())
-        told = {} if self.sampler is None else {self.sampler.key: self.sampler.told(episode)}
-        weights = told[COLLISION_WEIGHT].view(-1).numpy() if COLLISION_WEIGHT in told else None
+        context = {} if self.sampler is None else {self.sampler.key: self.sampler.told(episode)}
+        weights = context[COLLISION_WEIGHT].view(-1).numpy() if COLLISION_WEIGHT in context else None
         # Made once: the agents write into the same arrays at every step.
-        now = TensorDict({key: torch.from_numpy(written[key]) for key in AGENT_OBSERVATIONS} | told, [number])
+        now = TensorDict({key: torch.from_numpy(written[key]) for key in AGENT_OBSERVATIONS} | context, [number])
         now["is_init"] = torch.ones(number, 1, dtype=torch.bool, device="cpu")
         now[STATE_KEY] = torch.zeros(number, self.memory, dtype=torch.float32, device="cpu")
-        seen = {key: _room(written[key], self.steps + 1) for key in observed}
-        done = {key: _room(written[key], self.steps) for key in happened}
+        seen = {key: _empty_rows(written[key], self.steps + 1) for key in observed}
+        done = {key: _empty_rows(written[key], self.steps) for key in happened}
         done["action"] = np.empty((number, self.steps, ACTION_SIZE), np.float32)
         _note(seen, written, 0)
         for step in range(self.steps):
@@ -109,14 +111,14 @@ class Team:
             if (state := now.get(("next", STATE_KEY), None)) is not None:
                 now[STATE_KEY] = state
             now["is_init"].fill_(False)
-        return Driven(seen, done, {key: value.numpy() for key, value in told.items()})
+        return EpisodeBatch(seen, done, {key: value.numpy() for key, value in context.items()})
 
     def close(self) -> None:
         """Disconnect all simulations."""
         self.env.close(raise_if_closed=False)
 
 
-def _room(array: NDArray, times: int) -> NDArray:
+def _empty_rows(array: NDArray, times: int) -> NDArray:
     """Return an array for an agent's rows at some times, ``[N, times, ..]``."""
     return np.empty((len(array), times, *array.shape[1:]), array.dtype)
 

@@ -13,14 +13,14 @@ from typing import NamedTuple, Protocol
 import torch
 from tensordict import TensorDictBase
 
-from rcdsac_trl.rollout.worker import Driven, side_by_side
+from rcdsac_trl.rollout.worker import EpisodeBatch, side_by_side
 from rcdsac_trl.system.interrupts import interruption_point
 from rcdsac_trl.system.process_pool import ProcessPool
 
 _PRELOADED = "rcdsac_trl.rollout.make_collector"
 
 
-class Request(NamedTuple):
+class RolloutRequest(NamedTuple):
     """What is to be driven: an iteration's episodes, on a map, with an actor's weights (packed)."""
 
     iteration: int
@@ -28,23 +28,23 @@ class Request(NamedTuple):
     weights: bytes
 
 
-Drive = Callable[[Request, Callable[[], None]], Driven]
+Drive = Callable[[RolloutRequest, Callable[[], None]], EpisodeBatch]
 """Drives what is asked for; calls its second argument before every step."""
 MakeDrive = Callable[[], AbstractContextManager[Drive]]
 
 
-class Teams(Protocol):
-    """Teams that together hold all agents."""
+class WorkerGroup(Protocol):
+    """WorkerGroup that together hold all agents."""
 
-    def ask(self, request: Request) -> TensorDictBase:
-        """Return the episodes of all agents, ``[N, T]``, team after team."""
+    def ask(self, request: RolloutRequest) -> TensorDictBase:
+        """Return the episodes of all agents, ``[N, T]``, worker after worker."""
 
     def close(self) -> None:
-        """End the teams."""
+        """End the group."""
 
 
-class LocalTeam:
-    """One team, in this process.
+class LocalWorker:
+    """One worker, in this process.
 
     Args:
         make: makes what drives.
@@ -54,21 +54,21 @@ class LocalTeam:
         self._stack = contextlib.ExitStack()
         self._drive = self._stack.enter_context(make())
 
-    def ask(self, request: Request) -> TensorDictBase:
-        """See :class:`Teams`."""
+    def ask(self, request: RolloutRequest) -> TensorDictBase:
+        """See :class:`WorkerGroup`."""
         return self._drive(request, interruption_point).tensordict()
 
     def close(self) -> None:
-        """See :class:`Teams`."""
+        """See :class:`WorkerGroup`."""
         self._stack.close()
 
 
-class TeamProcesses:
-    """A process for each team. Nothing but :meth:`close` works after an error.
+class WorkerProcesses:
+    """A process for each worker. Nothing but :meth:`close` works after an error.
 
     Args:
-        makes: what makes each team's drive, in its process; must pickle.
-        described: the team of each, for messages.
+        makes: what makes each worker's drive, in its process; must pickle.
+        described: the worker of each, for messages.
         timeout_s: seconds in which a process must take a step, else it counts as hung; None: it never does.
     """
 
@@ -77,19 +77,19 @@ class TeamProcesses:
         single = [partial(_single_threaded, make) for make in makes]
         self.pool = ProcessPool(single, names, module=_PRELOADED, timeout_s=timeout_s)
 
-    def ask(self, request: Request) -> TensorDictBase:
-        """See :class:`Teams`.
+    def ask(self, request: RolloutRequest) -> TensorDictBase:
+        """See :class:`WorkerGroup`.
 
         Raises:
             WorkerError: if a process dies or hangs.
         """
         for number in range(len(self.pool)):
             self.pool.send(number, request)
-        answers: dict[int, Driven] = dict(self.pool.answers(until_done=True))
+        answers: dict[int, EpisodeBatch] = dict(self.pool.answers(until_done=True))
         return side_by_side([answers[number] for number in sorted(answers)]).tensordict()
 
     def close(self) -> None:
-        """See :class:`Teams`."""
+        """See :class:`WorkerGroup`."""
         self.pool.close()
 
 

@@ -18,7 +18,7 @@ from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, make_optimizer, make_relabel, packed, parameters
 from rcdsac_trl.rollout.make_collector import check_collector, make_episodes
-from rcdsac_trl.rollout.map_evaluator import Course, driver
+from rcdsac_trl.rollout.map_evaluator import EvaluationSpec, map_evaluator
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint import Checkpoints, Generators, load_average, rotate
 from rcdsac_trl.storage.checkpoint_record import DamagedError, Progress, Saved, best_damage, folder_name, newest
@@ -298,7 +298,7 @@ def _pending(
 
 def _snapshot_evaluator(settings: TrainingSettings, device: str, threads: int) -> SnapshotEvaluator:
     world, given = replace(settings.training_world, num_workers=0), settings.validation
-    course = Course(
+    course = EvaluationSpec(
         trained=settings,
         world=world,
         conditions=settings.algo.default_conditions,
@@ -312,7 +312,7 @@ def _snapshot_evaluator(settings: TrainingSettings, device: str, threads: int) -
     beside = resolve_processes_beside(given.processes, given.num_maps, threads)
     alone = min(usable_cores(), given.num_maps) if given.processes == "auto" else beside
     return SnapshotEvaluator(
-        partial(driver, course),
+        partial(map_evaluator, course),
         num_maps=given.num_maps,
         steps=world.task.episode_steps,
         processes=beside,

@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.errors import TrainingError
-from rcdsac_trl.rollout.episode_collectors import Episodes
+from rcdsac_trl.rollout.episode_collectors import EpisodeCollector
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint import Checkpoints
 from rcdsac_trl.storage.checkpoint_record import Progress
@@ -58,7 +58,7 @@ class Trainer:
         *,
         schedule: Schedule,
         progress: Progress,
-        episodes: Episodes,
+        episodes: EpisodeCollector,
         learner: Learner,
         guard: FiniteGuard,
         validation: Validation,

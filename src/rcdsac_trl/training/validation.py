@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import pandas as pd
 
-from rcdsac_trl.rollout.evaluation_pool import Drive, Drivers, Rows, drive_maps, prepare
+from rcdsac_trl.rollout.evaluation_pool import Drive, EvaluationPool, Rows, evaluate_maps, prepare
 from rcdsac_trl.rollout.measurement import table_of
 from rcdsac_trl.rollout.metrics import METRICS, validation_score
 from rcdsac_trl.storage.checkpoint_record import Progress
@@ -73,7 +73,7 @@ class SnapshotEvaluator:
         self._processes_alone = processes_alone
         self._timeout_s = timeout_s
         self._alone = False
-        self._drivers: Drivers | None = None
+        self._drivers: EvaluationPool | None = None
         self._maps: list[Rows] = []
         if self.beside:
             prepare()
@@ -98,11 +98,11 @@ class SnapshotEvaluator:
         if self.beside:
             self._begin(snapshot)
 
-    def _begin(self, snapshot: Snapshot) -> Drivers:
+    def _begin(self, snapshot: Snapshot) -> EvaluationPool:
         self._maps = []
         processes = self._processes_alone if self._alone else self._processes
         make = partial(self._make, snapshot.actor)
-        self._drivers = Drivers(make, self._num_maps, processes, timeout_s=self._timeout_s, at_once=True)
+        self._drivers = EvaluationPool(make, self._num_maps, processes, timeout_s=self._timeout_s, at_once=True)
         return self._drivers
 
     def poll(self) -> None:
@@ -124,7 +124,7 @@ class SnapshotEvaluator:
         if self.beside:
             self._receive(self.snapshot, until_done=True)
         else:
-            self._maps = list(drive_maps(partial(self._make, self.snapshot.actor), self._num_maps, processes=0))
+            self._maps = list(evaluate_maps(partial(self._make, self.snapshot.actor), self._num_maps, processes=0))
         self.close()
         self.snapshot = None
         return table_of(self._maps)

@@ -28,7 +28,7 @@ from rcdsac_trl.evaluation.course.course_film import FPS, frames
 from rcdsac_trl.evaluation.course.entries import Entry, entries_of
 from rcdsac_trl.evaluation.film.video import check_extra, write_video
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
-from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, drive_maps
+from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.provenance import commit
@@ -78,7 +78,7 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
     conditions = Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed)
 
     def drives() -> Generator[Rows, None, None]:
-        return drive_maps(partial(_driver, entries, jobs, conditions, settings.record), len(jobs), processes)
+        return evaluate_maps(partial(_driver, entries, jobs, conditions, settings.record), len(jobs), processes)
 
     return MeasuredRun(
         kind="course",

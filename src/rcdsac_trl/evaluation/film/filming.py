@@ -15,23 +15,23 @@ from rcdsac_trl.evaluation.film.trajectories import trajectories
 from rcdsac_trl.evaluation.film.video import write_video
 from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.rollout.make_agent import unpacked_loss
-from rcdsac_trl.rollout.map_evaluator import Agent, Course, driver
+from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
-from rcdsac_trl.rollout.worker import Team
+from rcdsac_trl.rollout.worker import RolloutWorker
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.interrupts import interruption_point
 from rcdsac_trl.world.task.episode import draw_motor_steps
 
 
 def write_film(
-    course: Course, agent: Agent | None, video: VideoSettings, headings: Sequence[str], folder: Path
+    spec: EvaluationSpec, agent: Agent | None, video: VideoSettings, headings: Sequence[str], folder: Path
 ) -> list[Path]:
     """Drive the episodes of a map once more, film one under every condition, and draw the trajectories.
 
     All agents drive again, so that those that are filmed do, bit by bit, what they did when they were measured.
 
     Args:
-        course: what is driven.
+        spec: what is driven.
         agent: what drives; None: the baseline drives.
         video: which episode is filmed.
         headings: one a condition.
@@ -40,8 +40,8 @@ def write_film(
     Returns:
         The files.
     """
-    tracks = recorded(course, agent, video.map, video.episode)
-    motor_steps = draw_motor_steps(course.world.task, course.split, course.seed, video.map, video.episode)
+    tracks = recorded(spec, agent, video.map, video.episode)
+    motor_steps = draw_motor_steps(spec.world.task, spec.split, spec.seed, video.map, video.episode)
     named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]
     frames = tqdm(film(named, motor_steps * MOTOR_PERIOD_S), total=len(tracks[0]), unit="frame", disable=None)
     name = f"map{video.map}-episode{video.episode}"
@@ -52,19 +52,19 @@ def write_film(
     return [*films, folder / f"ways-{name}.png"]
 
 
-def recorded(course: Course, agent: Agent | None, map_index: int, episode: int) -> list[list[Moment]]:
+def recorded(spec: EvaluationSpec, agent: Agent | None, map_index: int, episode: int) -> list[list[Moment]]:
     """Drive a map, and return the moments of one episode under every condition."""
-    rows = [block * course.num_episodes + episode for block in range(len(course.conditions))]
+    rows = [block * spec.num_episodes + episode for block in range(len(spec.conditions))]
     predictor = None
-    if agent is not None and course.trained.algo.critic == "quantile":
-        predictor = QuantilePredictor(unpacked_loss(course.trained, agent.loss).critics, rows)
+    if agent is not None and spec.trained.algo.critic == "quantile":
+        predictor = QuantilePredictor(unpacked_loss(spec.trained, agent.loss).critics, rows)
     watching: list[Recorder] = []
 
-    def watch(team: Team, policy: TensorDictModuleBase) -> Recorder:
-        watching.append(Recorder(policy, team.env.agents, rows, predictor))
+    def watch(worker: RolloutWorker, policy: TensorDictModuleBase) -> Recorder:
+        watching.append(Recorder(policy, worker.env.agents, rows, predictor))
         return watching[0]
 
     actor, loss = (None, None) if agent is None else agent
-    with driver(course, actor, loss, wrap=watch) as drive:
+    with map_evaluator(spec, actor, loss, wrap=watch) as drive:
         drive(map_index, interruption_point)
     return watching[0].tracks
