@@ -12,13 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from rcdsac_trl.system import runtime
+from rcdsac_trl.system.cores import usable_cores
 
 NUM_AGENTS = 10
 
 
 def cores() -> list[int]:
     """Return the cores that this process may use."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return sorted(allowed)[: usable_cores()]
 
 
 def prepare(threads: int = 1) -> None:

@@ -21,7 +21,7 @@ def main() -> None:
     options = parser.parse_args()
     bench.prepare()
     from rcdsac_trl.config.compose import compose
-    from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+    from rcdsac_trl.evaluation.evaluation import make_evaluation
 
     with tempfile.TemporaryDirectory() as folder:
         run = untrained(Path(folder) / "run", options.overrides)
@@ -33,7 +33,7 @@ def main() -> None:
             f"num_maps={options.maps + 2}",
         ]
         evaluation = make_evaluation(compose("evaluate", given))
-        done = [time.perf_counter() for _ in evaluation.maps()]
+        done = [time.perf_counter() for _ in evaluation.measure()]
     # From the second map done, when every process of two is at work, to the last.
     per_map = (done[-1] - done[1]) / options.maps
     bench.report(

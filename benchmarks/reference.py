@@ -29,13 +29,17 @@ class Features(nn.Module):
 
     def __init__(self, encoder: Encoder) -> None:
         super().__init__()
+        self.circular = encoder.range.padding == "circular"
         self.conv_1 = copy.deepcopy(encoder.range.conv_1)
         self.conv_2 = copy.deepcopy(encoder.range.conv_2)
         self.linear = copy.deepcopy(encoder.range.linear)
         self.vectors = copy.deepcopy(encoder.vectors)
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
-        positions = F.relu(self.conv_2(F.relu(self.conv_1(range_.flatten(0, 1).unsqueeze(1)))))
+        positions = range_.flatten(0, 1).unsqueeze(1)
+        for convolution, ends in ((self.conv_1, (1, 2)), (self.conv_2, (0, 1))):
+            padded = F.pad(positions, ends, mode="circular") if self.circular else positions
+            positions = F.relu(convolution(padded))
         ranges = F.relu(self.linear(positions.transpose(1, 2).flatten(1))).unflatten(0, range_.shape[:2])
         return torch.cat([ranges, *(F.relu(f(x)) for f, x in zip(self.vectors, vectors, strict=True))], dim=-1)
 
@@ -132,7 +136,7 @@ class ReferenceLoss(LossModule):
 
     def __init__(self, product: DistributionalSACLoss, generator: torch.Generator) -> None:
         super().__init__()
-        self.settings = product
+        self.product, self.settings = product, product.settings
         self.convert_to_functional(network(product.actor_network), "actor_network")
         critics = nn.ModuleList(network(critic) for critic in product.critic_network)
         self.convert_to_functional(critics, "critic_network", create_target_params=True)
@@ -142,11 +146,11 @@ class ReferenceLoss(LossModule):
 
     def __setattr__(self, name: str, value: object) -> None:
         # The product lends its settings only: its parameters are not this module's.
-        object.__setattr__(self, name, value) if name == "settings" else super().__setattr__(name, value)
+        object.__setattr__(self, name, value) if name == "product" else super().__setattr__(name, value)
 
     def forward(self, batch: TensorDictBase) -> TensorDict:
         """Return ``loss_qvalue``, ``loss_actor`` and ``loss_alpha`` of a batch ``[B, L+1]``."""
-        alpha, settings = self.log_alpha.detach().exp(), self.settings
+        alpha, product, settings = self.log_alpha.detach().exp(), self.product, self.settings
         current = batch[:, :-1].clone(False)
         target = self._target(batch, current, alpha)
 
@@ -160,8 +164,8 @@ class ReferenceLoss(LossModule):
         action, log_prob = self._act(current)
         tau = self._fractions(current, settings.num_risk_samples)
         if tau is not None:
-            told = settings.measure.temper(current["risk"], settings.distortion_strength)
-            tau = settings.measure.psi(tau, told)
+            told = product.measure.temper(current["risk"], product.distortion_strength)
+            tau = product.measure.psi(tau, told)
         with self.critic_network_params.detach().to_module(self.critic_network):
             values = [self._value(critic, current, action, tau).mean(-1) for critic in self.critic_network]
         loss_actor = (alpha * log_prob - torch.stack(values).amin(0)).mean()
@@ -192,7 +196,7 @@ class ReferenceLoss(LossModule):
             value = both.take_along_dim(chosen, 0).squeeze(0)
         value = value - alpha * log_prob.unsqueeze(-1)
         alive = 1.0 - current["next", "terminated"].to(value.dtype)
-        return current["next", "reward"] + self.settings.value_estimator.gamma * alive * value
+        return current["next", "reward"] + self.product.value_estimator.gamma * alive * value
 
     def _act(self, batch: TensorDictBase, skip: int = 0) -> tuple[Tensor, Tensor]:
         with self.actor_network_params.to_module(self.actor_network):

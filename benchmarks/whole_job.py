@@ -64,7 +64,7 @@ def run(overrides: list[str]) -> dict[str, float]:
             "replay_insertion": (trainer.learner.replay, "add_episodes"),
             "updates": (trainer.learner, "updates"),
             "checkpoints": (trainer.checkpoints, "save"),
-            "validation": (trainer.validate, "finish"),  # in place the whole of it, else how long training waits
+            "validation": (trainer.validation.evaluator, "finish"),  # in place all of it, else the wait
         }
         clocks = {name: Clock(getattr(owner, call)) for name, (owner, call) in timed.items()}
         for name, (owner, call) in timed.items():

@@ -14,6 +14,8 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import pytest
 import torch
 
+from rcdsac_trl.system.cores import usable_cores
+
 torch.set_num_threads(1)
 
 # Side by side, whole files are given out in this order: those that take longest first, so that no worker is left with
@@ -37,6 +39,11 @@ LONGEST = (
     "test_wheel",
     "test_course",
 )
+
+
+@pytest.hookimpl(optionalhook=True)  # where tests run side by side, pytest-xdist counts by it
+def pytest_xdist_auto_num_workers() -> int:
+    return usable_cores()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -17,8 +17,8 @@ from typing import Any
 
 import torch
 
-from rcdsac_trl.rollout import evaluation_pool
 from rcdsac_trl.storage.replay import SequenceReplay
+from rcdsac_trl.system import process_pool
 from rcdsac_trl.training.learner import Learner
 from rcdsac_trl.training.run_log import RunLog
 from rcdsac_trl.training.setup import resume_training
@@ -75,7 +75,7 @@ def work(job: dict[str, Any]) -> None:
 def main() -> None:
     """Do jobs until standard input ends; answer each with the status of its process."""
     torch.set_num_threads(1)
-    evaluation_pool.START_METHOD = "fork"  # a fork server would import everything for each job anew
+    process_pool.START_METHOD = "fork"  # a fork server would import everything for each job anew
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what trainings print goes elsewhere
     with TemporaryDirectory() as folder:  # what is compiled and which maps are made, all forks then have

@@ -65,6 +65,12 @@ def test_evaluation(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert found["seconds_for_500_episodes"] > 0
 
 
+def test_planners(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    run(load("planners"), monkeypatch, "--json", "--steps=10")
+    found = printed(capsys)
+    assert all(found[f"{name}_ms_per_decision"] > 0 for name in ("dwa", "mppi"))
+
+
 def test_learner(load: Any) -> None:
     common, program = load("bench_common"), load("learner")
     learner = common.make_learner("rcdsac_pow", SMALL)

@@ -14,8 +14,8 @@ from omegaconf import OmegaConf
 from rcdsac_trl import draw_maps
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
-from rcdsac_trl.experiments.make_search import make_search
-from rcdsac_trl.experiments.make_sweep import make_sweep
+from rcdsac_trl.experiments.optuna_search import make_search
+from rcdsac_trl.experiments.sweep_jobs import make_sweep
 from rcdsac_trl.training.setup import check_training
 from tiny import first_combinations_only
 
@@ -33,7 +33,7 @@ def texts(pattern: str) -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("name", "code"), texts(r"^```python\n(.*?)^```"))
 def test_python_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, name, "exec"), {})
+    exec(compile(code, name, "exec"), {"__name__": "__main__"})
 
 
 def test_the_reward_term_of_contributing_needs_one_file(tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_commands_are_accepted(verb: str, arguments: str, monkeypatch: pytest.Mo
     if verb == "train":
         check_training(cfg)
     elif verb == "draw_maps":
-        draw_maps.check(cfg)
+        draw_maps.main.check(cfg)
 
 
 def test_there_are_commands_of_every_verb() -> None:

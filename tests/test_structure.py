@@ -15,7 +15,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 import rcdsac_trl
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.agent.risk import MEASURES
 from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
 from rcdsac_trl.config.paths import CONF_DIR
@@ -72,7 +72,7 @@ FLOORS = (
 )
 SIDEWAYS = {("deploy", "agent")}
 # Files beside the rooms that serve all of them.
-SHARED = {"errors", "seeding"}
+SHARED = {"errors", "seeding", "tables"}
 # A room that reads files alone.
 APART = "report"
 ROOMS = set().union(*FLOORS, {APART})
@@ -186,7 +186,7 @@ def test_the_table_of_keys_is_what_the_environment_has() -> None:
     world = WorldSettings(MapSettings(size_m=10.0), TaskSettings(), sensor="narrow", num_agents=2, num_workers=0)
     found: dict[str, tuple[int, torch.dtype]] = {}
     for name in ("rcdsac_pow", "rcwr"):
-        env = environment(world, row(name), split="train", seed=0, agent_ids=range(2), memory=Widths().memory)
+        env = environment(world, row(name), split="train", seed=0, agent_ids=range(2), memory=NetworkSettings().memory)
         specs = all_specs(env)
         assert {spec.shape[:-1] for spec in specs.values()} == {env.batch_size}
         found |= {key: (spec.shape[-1], spec.dtype) for key, spec in specs.items()}
@@ -267,7 +267,7 @@ def as_lists(values: dict[str, Any]) -> dict[str, Any]:
 def test_the_code_has_the_defaults_of_the_configuration() -> None:
     assert conf("map/mixed.yaml") == as_lists(asdict(MapSettings()))
     assert conf("task/default.yaml") == as_lists(asdict(TaskSettings()))
-    assert conf("train.yaml")["network"] == asdict(Widths())
+    assert conf("train.yaml")["network"] == asdict(NetworkSettings())
 
 
 def test_every_map_set_gives_every_setting() -> None:

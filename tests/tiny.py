@@ -5,14 +5,21 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
+from torch.optim.swa_utils import AveragedModel
+from torchrl.objectives import LossModule
 
 from rcdsac_trl.config.compose import combinations, compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.evaluation.evaluation import make_evaluation
+from rcdsac_trl.rollout.make_agent import make_average, make_loss
+from rcdsac_trl.storage.checkpoint import Checkpoints
+from rcdsac_trl.storage.checkpoint_record import Progress
+from rcdsac_trl.training import run_log
 from rcdsac_trl.training.setup import check_training, make_trainer
 from rcdsac_trl.training.trainer import Trainer
 
@@ -71,6 +78,21 @@ def tiny_trainer(folder: Path, row: str = "rcdsac_pow", *overrides: str) -> Trai
     return make_trainer(cfg, folder)
 
 
+def untrained_run(folder: Path, row: str, *overrides: str) -> tuple[Path, LossModule, AveragedModel]:
+    """Write a run folder whose agent has its first weights, the average moved a little so that one can tell."""
+    cfg = tiny_cfg(row, *overrides)
+    trained = training_settings(cfg)
+    loss = make_loss(trained, "cpu")
+    average = make_average(loss, trained.learner)
+    with torch.no_grad():
+        for parameter in average.parameters():
+            parameter += 0.01
+    run_log.start_run_folder(folder, cfg, {})
+    components = {"loss": loss, "average": average}
+    Checkpoints(folder / "checkpoints", components, replay=None, keep=1).save(Progress(updates=7), {})
+    return folder, loss, average
+
+
 def evaluate(*overrides: str) -> Path:
     """Evaluate two episodes on one map, as the command line does; return where it wrote."""
     given = ["num_maps=1", "num_episodes=2", "num_workers=0", "threads=1", *overrides]
@@ -101,6 +123,6 @@ def _composed_once(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
 
 def first_combinations_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the first combination of each run of a sweep stand for the others, composed once for all sweeps."""
-    module = import_module("rcdsac_trl.experiments.make_sweep")
+    module = import_module("rcdsac_trl.experiments.sweep_jobs")
     monkeypatch.setattr(module, "combinations", lambda overrides: combinations(overrides)[:1])
     monkeypatch.setattr(module, "compose", lambda name, overrides: _composed_once(name, tuple(overrides)))

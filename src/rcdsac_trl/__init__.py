@@ -8,9 +8,9 @@ each other: they meet in these keys, each with the shape of one agent's entry.
 
 | key | shape, type | unit, values | written by | read by |
 |---|---|---|---|---|
-| `range` | 180 f32 | 2.5 + log10 m: 0, or 0.5 to 2.98 | env | encoders |
-| `waypoint` | 6 f32 | log10 m, cos, sin; of the next two | env | encoders, pursuit |
-| `velocity` | 4 f32 | m/s, rad/s measured; m/s, rad/s desired | env | encoders, metrics |
+| `range` | 180 f32 | 2.5 + log10 m: 0, or 0.5 to 2.98 | env | encoders, planners |
+| `waypoint` | 6 f32 | log10 m, cos, sin; of the next two | env | encoders, pursuit, planners |
+| `velocity` | 4 f32 | m/s, rad/s measured; m/s, rad/s desired | env | encoders, planners, metrics |
 | `action` | 2 f32 | -1 to 1 | actor | env, critics |
 | `risk` | 1 f32 | raw beta | EpisodeSampler, Relabel | actor, critics, psi |
 | `collision_weight` | 1 f32 | w_coll, RCWR only | EpisodeSampler | encoders, env, replay |

@@ -1,11 +1,13 @@
 """Hydra entry points whose mistakes end in one sentence and exit code 2, before anything is written."""
 
+import importlib
 import sys
 from argparse import Namespace
 from collections.abc import Callable
-from functools import partial, wraps
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -15,12 +17,70 @@ from rcdsac_trl.config.compose import combinations, compose, output_folder
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.system.resources import fault_sentence
-from rcdsac_trl.system.runtime import keep_pages, quiet_libraries
+from rcdsac_trl.system.runtime import bound_threads, keep_pages, let_workers_rest, quiet_libraries
 
 Task = Callable[[DictConfig], None]
 
 # What a shell reports for a process that Ctrl-C ended.
 INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Command:
+    """A verb that makes one object of its config and runs it; called, it is the program.
+
+    Functions may be named, ``"<module>:<function>"``, and are then imported when they are called: ``--help`` needs no
+    torch.
+
+    Attributes:
+        name: of the verb, and of its root config in ``conf/``.
+        make: takes the composed config, refuses what cannot work, writes nothing, and returns what has a ``run()`` that
+            works, writes and prints.
+        describe: puts a folder of results into words; ``run`` is given it.
+    """
+
+    name: str
+    make: str | Callable[[DictConfig], Any]
+    describe: str | None = None
+
+    def check(self, cfg: DictConfig) -> None:
+        """Refuse what cannot work, before anything is written."""
+        _function(self.make)(cfg)
+
+    def __call__(self) -> None:
+        """Do what ``python -m rcdsac_trl.<name>`` does."""
+
+        def task(cfg: DictConfig) -> None:
+            described_by = () if self.describe is None else (_function(self.describe),)
+            _function(self.make)(cfg).run(*described_by)
+
+        entry_point(self.name, check=self.check)(task)()
+
+
+@dataclass(frozen=True)
+class OverridesCommand:
+    """A verb whose overrides are meant for more than one config, so that what it makes composes for itself.
+
+    Attributes:
+        name: of the verb, and of the root config that ``--help`` and the like show.
+        make: as that of :class:`Command`, but takes the overrides.
+    """
+
+    name: str
+    make: str
+
+    def __call__(self) -> None:
+        """Do what ``python -m rcdsac_trl.<name>`` does."""
+        _program(self._start)
+
+    def _start(self) -> None:
+        arguments = read_arguments(sys.argv[1:])
+        if arguments is None:
+            _hydra_main(self.name, lambda cfg: None)
+        elif arguments.multirun:
+            raise UserInputError("-m is for `train`: leave it out")
+        else:
+            _function(self.make)(arguments.overrides).run()
 
 
 def entry_point(
@@ -42,54 +102,59 @@ def entry_point(
     """
 
     def decorate(task: Task) -> Callable[[], None]:
-        @wraps(task)
-        def guarded(cfg: DictConfig) -> None:
-            try:
-                check(cfg)
-                task(cfg)
-            except Exception as error:
-                _fail_or_raise(error)
-
-        def started() -> None:
-            asked = read_arguments(sys.argv[1:])
-            if instead is not None and asked is not None and instead(asked.overrides, asked.multirun):
+        def start() -> None:
+            arguments = read_arguments(sys.argv[1:])
+            if instead is not None and arguments is not None and instead(arguments.overrides, arguments.multirun):
                 return
             precheck(config_name, sys.argv[1:], check, check_folder)
-            hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
+            _hydra_main(config_name, task)
 
-        return partial(_program, started)
+        return partial(_program, start)
 
     return decorate
 
 
-def overrides_entry_point(config_name: str) -> Callable[[Callable[[list[str]], None]], Callable[[], None]]:
-    """Make a main of a task that composes for itself, since its overrides are meant for more than one config.
+def _hydra_main(config_name: str, task: Task) -> None:
+    def guarded(cfg: DictConfig) -> None:
+        try:
+            task(cfg)
+        except Exception as error:  # Hydra would print it in its own way
+            _fail_or_raise(error)
+
+    guarded.__module__ = f"rcdsac_trl.{config_name}"  # by which Hydra names the program
+    hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
+
+
+def late(name: str) -> Callable[..., Any]:
+    """Return a function that is imported when it is called.
 
     Args:
-        config_name: the root config that ``--help`` and the like show.
+        name: ``"<module>:<function>"``.
+
+    Example:
+        >>> late("math:hypot")(3.0, 4.0)
+        5.0
     """
-
-    def decorate(task: Callable[[list[str]], None]) -> Callable[[], None]:
-        def started() -> None:
-            asked = read_arguments(sys.argv[1:])
-            if asked is None:
-                hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(lambda cfg: None)()
-            elif asked.multirun:
-                raise UserInputError("-m is for `train`: leave it out")
-            else:
-                task(asked.overrides)
-
-        return partial(_program, started)
-
-    return decorate
+    return lambda *given: _function(name)(*given)
 
 
-def _program(started: Callable[[], None]) -> None:
+def _function(named: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Import the function that is named ``"<module>:<function>"``."""
+    if not isinstance(named, str):
+        return named
+    module, _, name = named.partition(":")
+    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    return function
+
+
+def _program(start: Callable[[], None]) -> None:
     """Do what a program does, so that a mistake, a fault and Ctrl-C each end it as its users expect."""
-    keep_pages()
-    quiet_libraries()
     try:
-        started()
+        bound_threads()
+        keep_pages()
+        quiet_libraries()
+        let_workers_rest()
+        start()
     except KeyboardInterrupt:
         print("rcdsac_trl: interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
@@ -106,8 +171,8 @@ def fail(error: UserInputError | FaultError) -> NoReturn:
 def _fail_or_raise(error: Exception) -> NoReturn:
     if isinstance(error, UserInputError | FaultError):
         fail(error)
-    if (told := fault_sentence(error)) is not None:
-        fail(FaultError(told))
+    if (sentence := fault_sentence(error)) is not None:
+        fail(FaultError(sentence))
     raise error
 
 

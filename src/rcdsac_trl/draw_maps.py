@@ -6,47 +6,23 @@ the true shortest path, which knows the unmapped clutter as well.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, Polygon
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from rcdsac_trl.cli import entry_point
-from rcdsac_trl.config.typed import read
+from rcdsac_trl.cli import Command
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.seeding import stream
+from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.resources import check_picture
-from rcdsac_trl.world.maps.generator import SPLITS, Map, MapSettings, Split, generate_map
-from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
-from rcdsac_trl.world.maps.planner import Planner
+from rcdsac_trl.world.maps.contact_sheet import contact_sheet
+from rcdsac_trl.world.maps.generator import MapSettings, Split
 
-_FLOOR = "#f7f5f0"
-_WALL = "#3d4450"
-_MAPPED = "#8d99ae"
-_UNMAPPED = "#e07a3f"
-_MOVER = "#7b4fa3"
-_START = "#2a9d5c"
-_GOAL = "#d62839"
-_WAYPOINTS = "#1d6fd1"
-_TRUE_PATH = "#2b2b2b"
 _MAX_COUNT = 100
-_PANEL_INCHES = 3.6
-_DOTS = (0, (1.0, 1.2))
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """What to draw; every field is a key of ``conf/draw_maps.yaml``.
-
-    Attributes:
-        out: the PNG file.
-        count: how many maps, 1 to 100.
-        split: which family of maps.
-        seed: the root seed of the maps, starts and goals, at least 0.
+    """The root of ``conf/draw_maps.yaml``, which explains the keys.
 
     Raises:
         UserInputError: a value is outside its limits.
@@ -56,101 +32,29 @@ class Sheet:
     count: int
     split: Split
     seed: int
+    map: MapSettings
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
         check_picture(Path(self.out))
-        if not isinstance(self.count, int) or not 1 <= self.count <= _MAX_COUNT:
+        if not 1 <= self.count <= _MAX_COUNT:
             raise UserInputError(f"count={self.count} is not a whole number from 1 to {_MAX_COUNT}: use one")
-        if self.split not in SPLITS:
-            raise UserInputError(f"split={self.split} does not exist: choose one of {', '.join(SPLITS)}")
-        if not isinstance(self.seed, int) or self.seed < 0:
-            raise UserInputError(f"seed={self.seed} is not a whole number of at least 0: use one")
+        check_least("seed", self.seed, 0)
+
+    def run(self) -> None:
+        """Write the picture."""
+        out = Path(self.out)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        contact_sheet(self.map, self.split, self.seed, self.count).savefig(out, dpi=130)
+        print(f"drew {self.count} maps: {out}")
 
 
-def contact_sheet(sheet: Sheet, settings: MapSettings) -> Figure:
-    """Return a figure with the first maps of a family, drawn from the given settings."""
-    columns = min(sheet.count, 4)
-    rows = -(-sheet.count // columns)
-    size = (columns * _PANEL_INCHES, rows * (_PANEL_INCHES + 0.25) + 0.7)
-    figure = Figure(figsize=size, layout="constrained")
-    for index in range(sheet.count):
-        map_ = generate_map(settings, sheet.split, sheet.seed, index)
-        axes = figure.add_subplot(rows, columns, index + 1)
-        axes.set_title(f"{sheet.split} {index} · {map_.layout}", fontsize=9, color=_WALL)
-        draw_map(axes, map_, Planner(map_), stream(sheet.seed, f"draw/{sheet.split}", index))
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=2 * min(columns, 2), frameon=False)
-    return figure
+def make_sheet(cfg: DictConfig) -> Sheet:
+    """Read what to draw."""
+    return read_config(cfg, Sheet)
 
 
-def draw_map(axes: Axes, map: Map, planner: Planner, rng: np.random.Generator) -> None:
-    """Draw one map, with a start and a goal and the paths between them.
-
-    Args:
-        axes: where to draw.
-        map: the map.
-        planner: the map's planner.
-        rng: draws start, goal and the movers' places.
-    """
-    axes.set(xlim=(0, map.size_m), ylim=(0, map.size_m), aspect="equal", xticks=[], yticks=[])
-    axes.set_facecolor(_FLOOR)
-    axes.spines[:].set_visible(False)
-    for box in map.boxes:
-        color = _WALL if box.wall else _MAPPED if box.mapped else _UNMAPPED
-        axes.add_patch(Polygon(box.corners(), facecolor=color))
-    for cylinder in map.cylinders:
-        color = _MAPPED if cylinder.mapped else _UNMAPPED
-        axes.add_patch(Circle((cylinder.x, cylinder.y), cylinder.radius, facecolor=color))
-    for mover in map.movers:
-        x, y = planner.sample_mover_point(rng)
-        axes.add_patch(Circle((x, y), mover.radius, facecolor=_MOVER, edgecolor="white", linewidth=0.6))
-    start = planner.sample_free(rng)
-    # Half the map's size away, so that the path shows something of the place.
-    goal = planner.sample_goal(rng, start, map.size_m / 2)
-    true_path = np.vstack([start, planner.true_path(start, goal)])
-    waypoints = np.vstack([start, planner.waypoints(start, goal)])
-    axes.plot(*true_path.T, color=_TRUE_PATH, linewidth=1.1, linestyle=_DOTS)
-    axes.plot(*waypoints.T, color=_WAYPOINTS, linewidth=1.3, marker="o", markersize=3)
-    axes.add_patch(Circle((start[0], start[1]), ROBOT_RADIUS_M, facecolor=_START, zorder=3))
-    axes.plot(*goal, color=_GOAL, marker="*", markersize=10, markeredgecolor="white", markeredgewidth=0.6)
-
-
-def _legend() -> list[Patch | Line2D]:
-    def dot(color: str, marker: str, label: str, size: float = 8) -> Line2D:
-        return Line2D([], [], color=color, marker=marker, linestyle="", markersize=size, label=label)
-
-    return [
-        Patch(color=_WALL, label="wall"),
-        Patch(color=_MAPPED, label="clutter, mapped"),
-        Patch(color=_UNMAPPED, label="clutter, unmapped"),
-        dot(_MOVER, "o", "mover"),
-        dot(_START, "o", "start"),
-        dot(_GOAL, "*", "goal", 11),
-        Line2D([], [], color=_WAYPOINTS, marker="o", markersize=3, label="waypoints (what the planner knows)"),
-        Line2D([], [], color=_TRUE_PATH, linestyle=_DOTS, label="true shortest path"),
-    ]
-
-
-def _read(cfg: DictConfig) -> tuple[Sheet, MapSettings]:
-    values = cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
-    map_values = values.pop("map")
-    return read(Sheet, values), read(MapSettings, map_values, "map")
-
-
-def check(cfg: DictConfig) -> None:
-    """Refuse what cannot be drawn, before anything is written."""
-    _read(cfg)
-
-
-@entry_point("draw_maps", check=check)
-def main(cfg: DictConfig) -> None:
-    """Write the contact sheet."""
-    sheet, settings = _read(cfg)
-    out = Path(sheet.out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    contact_sheet(sheet, settings).savefig(out, dpi=130)
-    print(f"drew {sheet.count} maps: {out}")
-
+main = Command("draw_maps", make_sheet)
 
 if __name__ == "__main__":
     main()

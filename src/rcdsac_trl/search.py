@@ -1,15 +1,8 @@
 """Search for better hyper-parameters: ``python -m rcdsac_trl.search +algo=rcdsac_pow search.name=mine``."""
 
-from rcdsac_trl.cli import overrides_entry_point
+from rcdsac_trl.cli import OverridesCommand
 
-
-@overrides_entry_point("search")
-def main(overrides: list[str]) -> None:
-    """Train one trial after another; beside others, if the same call runs elsewhere."""
-    from rcdsac_trl.experiments.make_search import make_search
-
-    make_search(overrides).run()
-
+main = OverridesCommand("search", "rcdsac_trl.experiments.optuna_search:make_search")
 
 if __name__ == "__main__":
     main()

@@ -1,33 +1,18 @@
 """Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``; go on: ``.. resume=runs/<folder>``; many: ``-m``."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.cli import entry_point
+from rcdsac_trl.cli import entry_point, late
 
 if TYPE_CHECKING:
     from rcdsac_trl.training.trainer import Trainer
 
 
-def check(cfg: DictConfig) -> None:
-    """Refuse what cannot work, before anything is written."""
-    from rcdsac_trl.training.setup import check_training
-
-    check_training(cfg)
-
-
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that already holds a run, before Hydra makes it."""
-    from rcdsac_trl.training import run_log
-
-    run_log.check_folder(folder)
-
-
 def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
     """Run a sweep, or continue a run, if the call asks for that; return whether it did. Hydra has no part in either."""
-    from rcdsac_trl.experiments.make_sweep import check_single, make_sweep
+    from rcdsac_trl.experiments.sweep_jobs import check_single, make_sweep
     from rcdsac_trl.training.resume import run_to_continue
     from rcdsac_trl.training.setup import resume_training
 
@@ -46,7 +31,12 @@ def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
     return True
 
 
-@entry_point("train", check=check, check_folder=check_folder, instead=sweep_or_continue)
+@entry_point(
+    "train",
+    check=late("rcdsac_trl.training.setup:check_training"),
+    check_folder=late("rcdsac_trl.training.run_log:check_folder"),
+    instead=sweep_or_continue,
+)
 def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
     from rcdsac_trl.training.setup import given_overrides, make_trainer, run_folder

@@ -78,8 +78,8 @@ def test_what_fails_in_a_part_fails_in_the_call() -> None:
 
 
 def test_parts_are_even_and_not_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert batch_threads.cut(SEQUENCES, STEPS) == [slice(0, 2), slice(2, 4), slice(4, 7)]
-    assert batch_threads.cut(2, 100) == [slice(0, 1), slice(1, 2)]
+    assert batch_threads.split_batch(SEQUENCES, STEPS) == [slice(0, 2), slice(2, 4), slice(4, 7)]
+    assert batch_threads.split_batch(2, 100) == [slice(0, 1), slice(1, 2)]
     in_one_piece(monkeypatch)
-    assert batch_threads.cut(SEQUENCES, STEPS) == [slice(0, SEQUENCES)]
-    assert batch_threads.cut(2 * SEQUENCES, STEPS) == [slice(0, SEQUENCES), slice(SEQUENCES, 2 * SEQUENCES)]
+    assert batch_threads.split_batch(SEQUENCES, STEPS) == [slice(0, SEQUENCES)]
+    assert batch_threads.split_batch(2 * SEQUENCES, STEPS) == [slice(0, SEQUENCES), slice(SEQUENCES, 2 * SEQUENCES)]

@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
-from rcdsac_trl.agent.networks import ActorHead, QuantileHead, Widths
+from rcdsac_trl.agent.loss.loss_settings import LossSettings
+from rcdsac_trl.agent.networks import ActorHead, NetworkSettings, QuantileHead
 from rcdsac_trl.agent.risk import Neutral, PowerLaw, RiskMeasure
 
-WIDTHS = Widths(memory=2, head=32, cosines=16)
+WIDTHS = NetworkSettings(memory=2, head=32, cosines=16)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 
 
@@ -40,10 +41,8 @@ def make_loss(measure: RiskMeasure, told: RiskMeasure | None, alpha: float, gamm
     return DistributionalSACLoss(
         network(ActorHead(1, WIDTHS, told), risk, ["loc", "scale"]),
         [network(QuantileHead(1, WIDTHS, told), ["action", "tau", *risk], ["quantiles"])],
+        LossSettings(fractions_per="transition", kappa=0.1, alpha_init=alpha),
         measure=measure,
-        fractions_per="transition",
-        kappa=0.1,
-        alpha_init=alpha,
         generator=torch.Generator().manual_seed(0),
     ).make_value_estimator(gamma=gamma)
 

@@ -3,6 +3,8 @@
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -17,13 +19,17 @@ from torchrl.objectives.utils import ValueEstimators
 from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.loss.functional import _quantile_huber_pairwise, quantile_huber_loss, squash
+from rcdsac_trl.agent.loss.loss_settings import LossSettings
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
-SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
+SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
+#: Of the losses computed by hand.
+LINEAR = LossSettings(num_quantiles=3, num_target_quantiles=2, num_risk_samples=4, alpha_init=0.2)
+Reduction = Literal["mean", "sum", "none"]
 
 
 @pytest.fixture(autouse=True)
@@ -40,16 +46,19 @@ def make_batch(sequences: int = 3, steps: int = 4, beta: float | None = None) ->
     return TensorDict(content, batch_size=shape)
 
 
-def make_loss(kind: str = "rcdsac", number: int = 2, **settings: object) -> DistributionalSACLoss:
+def make_loss(
+    kind: str = "rcdsac", number: int = 2, *, reduction: Reduction = "mean", **settings: Any
+) -> DistributionalSACLoss:
     measure = PowerLaw()
     told = measure if kind == "rcdsac" else None
     critic = "scalar" if kind == "sac" else "quantile"
     loss = DistributionalSACLoss(
         build_actor(2, VECTOR_OBSERVATIONS, told, SMALL),
         [build_critic(2, VECTOR_OBSERVATIONS, critic, told, SMALL) for _ in range(number)],
+        LossSettings(**settings),
         measure=measure,
+        reduction=reduction,
         generator=torch.Generator().manual_seed(3),
-        **settings,  # type: ignore[arg-type]
     )
     loss.make_value_estimator(gamma=0.9)
     SoftUpdate(loss, eps=0.99)
@@ -151,7 +160,7 @@ class LinearCritic(nn.Module):
         return memory + self.slope * action + tau * (2.0 + risk)
 
 
-def linear_loss(**settings: object) -> DistributionalSACLoss:
+def linear_loss(*, reduction: Reduction = "mean", **settings: Any) -> DistributionalSACLoss:
     def network(factor: float, head: nn.Module, in_keys: list[str], out_keys: list[str]) -> TensorDictSequential:
         return TensorDictSequential(
             TensorDictModule(Passes(factor), in_keys=["observation"], out_keys=["memory"]),
@@ -162,13 +171,10 @@ def linear_loss(**settings: object) -> DistributionalSACLoss:
     loss = DistributionalSACLoss(
         network(1.0, LinearActor(), ["risk"], ["loc", "scale"]),
         [network(f, LinearCritic(s), keys, ["quantiles"]) for f, s in ((0.5, 0.7), (0.8, -0.4))],
+        replace(LINEAR, **settings),
         measure=CVaR(),
-        num_quantiles=3,
-        num_target_quantiles=2,
-        num_risk_samples=4,
-        alpha_init=0.2,
+        reduction=reduction,
         generator=torch.Generator().manual_seed(11),
-        **settings,  # type: ignore[arg-type]
     )
     loss.make_value_estimator(gamma=0.9)
     SoftUpdate(loss, eps=0.99)
@@ -362,7 +368,7 @@ def test_no_bootstrap_beyond_termination() -> None:
     batch = make_batch(beta=-1.0)
     batch["next", "terminated"][:] = True
     loss = make_loss(num_target_quantiles=5)
-    target = loss.compute_target(batch, loss.encode_actor(batch), loss.draw(batch))
+    target = loss.compute_target(batch, loss.encode_actor(batch), loss.draw_samples(batch))
     torch.testing.assert_close(target, batch["next", "reward"][:, :-1].expand(3, 4, 5))
 
 
@@ -380,7 +386,7 @@ def test_fractions_per_transition_and_per_sequence() -> None:
     shapes = {}
     for per in ("sequence", "transition"):
         loss = make_loss(fractions_per=per, num_quantiles=7)
-        fractions = loss.draw(make_batch()).tau
+        fractions = loss.draw_samples(make_batch()).tau
         assert fractions is not None
         shapes[per] = fractions.shape
         assert torch.isfinite(loss(make_batch())["loss_qvalue"])
@@ -390,8 +396,8 @@ def test_fractions_per_transition_and_per_sequence() -> None:
 def test_stratified_fractions_fall_into_a_part_each_and_are_uniform_in_it() -> None:
     loss = make_loss(fraction_sampling="stratified", num_quantiles=7, num_target_quantiles=4, num_risk_samples=2)
     batch = make_batch().repeat(400, 1)
-    draws = loss.draw(batch)
-    for fractions, number in ((draws.tau, 7), (draws.next_tau, 4), (draws.risk_tau, 2)):
+    samples = loss.draw_samples(batch)
+    for fractions, number in ((samples.tau, 7), (samples.next_tau, 4), (samples.risk_tau, 2)):
         assert fractions is not None
         assert fractions.shape == (1200, 1, number)
         within = number * fractions - torch.arange(number)
@@ -469,11 +475,8 @@ def test_nested_keys_and_set_keys() -> None:
     loss = DistributionalSACLoss(
         network(1.0, LinearActor(), [("agents", "beta")], [("agents", "mu"), ("agents", "sigma")]),
         [network(f, LinearCritic(s), keys, [("agents", "z")]) for f, s in ((0.5, 0.7), (0.8, -0.4))],
+        LINEAR,
         measure=CVaR(),
-        num_quantiles=3,
-        num_target_quantiles=2,
-        num_risk_samples=4,
-        alpha_init=0.2,
         generator=torch.Generator().manual_seed(11),
     )
     loss.set_keys(action=("agents", "u"), risk=("agents", "beta"), tau=("agents", "fraction"))
@@ -534,7 +537,7 @@ def test_targets_come_from_the_target_parameters(
 
     def target() -> Tensor:
         loss.rng_state = torch.Generator().manual_seed(3).get_state()
-        return loss.compute_target(batch, loss.encode_actor(batch), loss.draw(batch))
+        return loss.compute_target(batch, loss.encode_actor(batch), loss.draw_samples(batch))
 
     before = target()
     for parameter in loss.critic_network_params.parameters():
@@ -587,14 +590,13 @@ def test_state_dict_continues_bit_for_bit() -> None:
     ("settings", "message"),
     [
         ({"number": 0}, "at least one critic"),
-        ({"num_quantiles": 0}, "at least 1"),
-        ({"alpha_init": 0.0}, "above 0"),
-        ({"kappa": -1.0}, "above 0"),
-        ({"burn_in": -1}, "at least 0"),
-        ({"fractions_per": "batch"}, "'sequence' or 'transition'"),
-        ({"fraction_sampling": "sobol"}, "'uniform' or 'stratified'"),
-        ({"target_over_critics": "maximum"}, "one of minimum, smaller, mean"),
-        ({"loss_function": "l3"}, "'smooth_l1' or 'l2'"),
+        ({"num_quantiles": 0}, "loss.num_quantiles=0 is not a number of at least 1"),
+        ({"alpha_init": 0.0}, "loss.alpha_init=0.0 is not a positive number"),
+        ({"kappa": -1.0}, "loss.kappa=-1.0 is not a positive number"),
+        ({"burn_in": -1}, "loss.burn_in=-1 is not a number of at least 0"),
+        ({"fractions_per": "batch"}, "loss.fractions_per=batch is unknown: choose one of transition, sequence"),
+        ({"fraction_sampling": "sobol"}, "choose one of uniform, stratified"),
+        ({"target_over_critics": "maximum"}, "choose one of minimum, smaller, mean"),
         ({"reduction": "median"}, "'mean', 'sum' or 'none'"),
     ],
 )
@@ -636,8 +638,7 @@ class Policy(nn.Module):
         return self.split(self.columns(observation))
 
 
-@pytest.mark.parametrize("loss_function", ["smooth_l1", "l2"])
-def test_scalar_mode_equals_torchrls_sac(loss_function: str) -> None:
+def test_scalar_mode_equals_torchrls_sac() -> None:
     """Same weights, batch and noise: one-step sequences with an encoder that passes the observation on."""
     policy, critics = Policy(), [Columns(5, 1), Columns(5, 1)]
     their_policy = copy.deepcopy(policy)
@@ -649,7 +650,6 @@ def test_scalar_mode_equals_torchrls_sac(loss_function: str) -> None:
             distribution_class=TanhNormal,
         ),
         [ValueOperator(copy.deepcopy(c), in_keys=["observation", "action"]) for c in critics],
-        loss_function=loss_function,
         alpha_init=0.3,
         target_entropy=-2.0,
     )
@@ -665,9 +665,7 @@ def test_scalar_mode_equals_torchrls_sac(loss_function: str) -> None:
     ours = DistributionalSACLoss(
         network(policy, [], ["loc", "scale"]),
         [network(critic, ["action"], ["state_action_value"]) for critic in critics],
-        loss_function=loss_function,  # type: ignore[arg-type]
-        alpha_init=0.3,
-        target_entropy=-2.0,
+        LossSettings(alpha_init=0.3),
         generator=generator,
     ).make_value_estimator(gamma=0.9)
     for loss in (theirs, ours):  # targets that differ from the online critics

@@ -9,15 +9,16 @@ import pytest
 import torch
 
 from rcdsac_trl.agent.kernels import matmul
-from rcdsac_trl.agent.kernels.matmul import times, times_transposed, transposed_times
+from rcdsac_trl.agent.kernels.matmul import matmul as multiply
+from rcdsac_trl.agent.kernels.matmul import matmul_nt, matmul_tn
 
 Array = np.ndarray[Any, Any]
 Product = Callable[[Array, Array, Array, bool], None]
 
 PRODUCTS: list[tuple[Product, Callable[[Array, Array], tuple[Array, Array]]]] = [
-    (times, lambda a, b: (a, b)),
-    (times_transposed, lambda a, b: (a, np.ascontiguousarray(b.T))),
-    (transposed_times, lambda a, b: (np.ascontiguousarray(a.T), b)),
+    (multiply, lambda a, b: (a, b)),
+    (matmul_nt, lambda a, b: (a, np.ascontiguousarray(b.T))),
+    (matmul_tn, lambda a, b: (np.ascontiguousarray(a.T), b)),
 ]
 
 
@@ -88,9 +89,9 @@ def test_either_librarys_routine_multiplies(in_torch: bool) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_room_begins_where_torchs_tensors_do(kind: type) -> None:
+def test_empty_aligned_begins_where_torchs_tensors_do(kind: type) -> None:
     for size in range(1, 40):  # of many sizes, some would not by themselves
-        given = matmul.room((size, 3), np.zeros(1, kind))
+        given = matmul.empty_aligned((size, 3), np.zeros(1, kind))
         assert (given.shape, given.dtype) == ((size, 3), np.dtype(kind))
         assert given.ctypes.data % 64 == 0
         given[:] = 1.0

@@ -13,21 +13,23 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.agent.actor import build_actor, build_critic, build_policy
 from rcdsac_trl.agent.kernels import feature_kernels, quantile_kernels, quantile_values
+from rcdsac_trl.agent.kernels.dispatch import FEW_OBSERVATIONS
+from rcdsac_trl.agent.kernels.observation_features import observation_features
 from rcdsac_trl.agent.kernels.recurrent_kernels import _GatedRecurrence, gated_recurrence
 from rcdsac_trl.agent.networks import (
-    FEW_OBSERVATIONS,
     ActorHead,
     Encoder,
+    NetworkSettings,
     QuantileHead,
     RangeFeatures,
     ScalarHead,
-    Widths,
 )
 from rcdsac_trl.agent.risk import CVaR, PowerLaw
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
+from rcdsac_trl.robot.ring import Padding
 
-SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
+SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 VECTORS = {**VECTOR_OBSERVATIONS, "collision_weight": 1}
 
 
@@ -52,29 +54,34 @@ BLOCK = feature_kernels.ROWS_PER_BLOCK // 43
 NARROW = [*range(21), *range(158, 180)]
 
 
+def range_by_kernels(module: RangeFeatures, bins: Tensor) -> Tensor:
+    return observation_features(module.padded(bins), [], (module.conv_1, module.conv_2, module.linear), [])
+
+
 @pytest.mark.parametrize("number", [FEW_OBSERVATIONS, BLOCK, 2 * BLOCK + 3])
-@pytest.mark.parametrize("heard", [list(range(180)), NARROW, [90], list(range(9, 180, 10)), []])
-def test_range_features_equal_the_layers(number: int, heard: list[int]) -> None:
-    module = RangeFeatures(6, 16).double()
+@pytest.mark.parametrize("active", [list(range(180)), NARROW, [90], list(range(9, 180, 10)), []])
+@pytest.mark.parametrize("padding", ["circular", "none"])
+def test_range_features_equal_the_layers(number: int, active: list[int], padding: Padding) -> None:
+    module = RangeFeatures(6, 16, padding).double()
     bins = torch.zeros(number, 180, dtype=torch.float64)
-    bins[:, heard] = torch.rand(number, len(heard), dtype=torch.float64)
-    fast, plain = module(bins), module.layers(bins)
+    bins[:, active] = torch.rand(number, len(active), dtype=torch.float64)
+    fast, plain = range_by_kernels(module, bins), module(bins)
     torch.testing.assert_close(fast, plain)
     parameters = list(module.parameters())
     torch.testing.assert_close(gradients(fast, parameters), gradients(plain, parameters))
     with torch.no_grad():
-        torch.testing.assert_close(module(bins), plain)
+        torch.testing.assert_close(range_by_kernels(module, bins), plain)
 
 
-def test_silent_bins_are_left_out() -> None:
+def test_inactive_bins_are_left_out() -> None:
     bins = np.zeros((3, 180), np.float32)
-    assert feature_kernels.heard_positions(bins + 1.0, 5).tolist() == list(range(43))
+    assert feature_kernels.active_positions(bins + 1.0, 5).tolist() == list(range(43))
     # Bins 0..20 reach positions 0..10 of the first convolution and 0..5 of the second; 158..179 reach 77..87, 38..42.
     bins[1, NARROW] = 1.0
-    assert feature_kernels.heard_positions(bins, 5).tolist() == [*range(6), *range(38, 43)]
+    assert feature_kernels.active_positions(bins, 5).tolist() == [*range(6), *range(38, 43)]
     # Bin 0 reaches position 0, bin 14 reaches 2 and 3.
-    assert feature_kernels.heard_positions(np.eye(180, dtype=np.float32)[[0, 14]], 5).tolist() == [0, 2, 3]
-    assert feature_kernels.heard_positions(0.0 * bins, 5).tolist() == [0]
+    assert feature_kernels.active_positions(np.eye(180, dtype=np.float32)[[0, 14]], 5).tolist() == [0, 2, 3]
+    assert feature_kernels.active_positions(0.0 * bins, 5).tolist() == [0]
 
 
 @pytest.mark.parametrize(("rows", "steps"), [(1, 1), (1, 4), (3, 1), (5, 6)])
@@ -110,7 +117,9 @@ def quantile_head(
 
 
 def by_kernels(head: QuantileHead, inputs: Inputs) -> Tensor:
-    return quantile_values.quantile_values(*inputs, head.cosines.frequencies, head.stack)
+    gate_beta = None if head.measure is None else head.gate_beta
+    layers = quantile_values.HeadLayers(head.input, head.gate_tau, gate_beta, head.hidden, head.output)
+    return quantile_values.quantile_values(*inputs, head.cosines.frequencies, layers)
 
 
 @pytest.mark.parametrize("steps", [1, 3, 300])
@@ -157,18 +166,18 @@ def test_range_features_export_as_plain_layers() -> None:
 # ------------------------------------------------------------------------------------------------ encoder
 def test_encoder_shapes() -> None:
     batch = observations(3, 9)
-    encoder = Encoder(VECTORS, Widths())
+    encoder = Encoder(VECTORS, NetworkSettings())
     inputs = [batch["range"], *(batch[key] for key in VECTORS)]
     assert encoder(*inputs).shape == (3, 9, 128)
-    state = encoder.step(*(x[:, 0] for x in inputs), torch.ones(3, 1, dtype=torch.bool), torch.zeros(3, 128))
-    assert state.shape == (3, 128)
+    memory, state = encoder.step(*(x[:, 0] for x in inputs), torch.ones(3, 1, dtype=torch.bool), torch.zeros(3, 128))
+    assert memory.shape == state.shape == (3, 128)
 
 
 @pytest.mark.parametrize("lead", [(10,), (2, 5), (1,), ()])
 def test_steps_equal_the_sequence(lead: tuple[int, ...]) -> None:
     """Step by step with carried memory is the sequence mode, and `is_init` is a fresh sequence."""
     steps, restart = 7, 4
-    encoder = Encoder(VECTORS, Widths())
+    encoder = Encoder(VECTORS, NetworkSettings())
     batch = observations(max(1, torch.Size(lead).numel()), steps)
     inputs = [batch["range"], *(batch[key] for key in VECTORS)]
     whole = encoder(*inputs)
@@ -177,17 +186,17 @@ def test_steps_equal_the_sequence(lead: tuple[int, ...]) -> None:
         state = torch.full((*lead, 128), 0.5)  # leftovers of another episode
         for t in range(steps):
             is_init = torch.full((*lead, 1), t == 0 or (restarted and t == restart))
-            state = encoder.step(*(x[:, t].reshape(*lead, -1) for x in inputs), is_init, state)
+            memory, state = encoder.step(*(x[:, t].reshape(*lead, -1) for x in inputs), is_init, state)
             expected = fresh[:, t - restart] if restarted and t >= restart else whole[:, t]
-            torch.testing.assert_close(state.reshape(-1, 128), expected, rtol=1e-5, atol=1e-6)
+            torch.testing.assert_close(memory.reshape(-1, 128), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_only_the_agents_that_begin_are_zeroed() -> None:
     encoder = Encoder(VECTORS, SMALL)
     batch = observations(2)
     inputs = [batch["range"], *(batch[key] for key in VECTORS)]
-    one = encoder.step(*inputs, torch.tensor([[True], [False]]), torch.ones(2, SMALL.memory))
-    none = encoder.step(*inputs, torch.zeros(2, 1, dtype=torch.bool), torch.ones(2, SMALL.memory))
+    one, _ = encoder.step(*inputs, torch.tensor([[True], [False]]), torch.ones(2, SMALL.memory))
+    none, _ = encoder.step(*inputs, torch.zeros(2, 1, dtype=torch.bool), torch.ones(2, SMALL.memory))
     assert torch.equal(one[1], none[1])
     assert not torch.equal(one[0], none[0])
 
@@ -195,15 +204,15 @@ def test_only_the_agents_that_begin_are_zeroed() -> None:
 # ------------------------------------------------------------------------------------------------ heads
 def test_head_shapes_and_bounds() -> None:
     memory, action = 100.0 * torch.randn(3, 8, 128), torch.rand(3, 8, 2)
-    loc, scale = ActorHead(2, Widths(), CVaR())(memory, torch.rand(3, 1, 1))
+    loc, scale = ActorHead(2, NetworkSettings(), CVaR())(memory, torch.rand(3, 1, 1))
     assert loc.shape == scale.shape == (3, 8, 2)
     assert scale.min() >= torch.tensor(-20.0).exp()
     assert scale.max() <= torch.tensor(2.0).exp()
     for tau_steps, risk_steps in [(1, 1), (1, 8), (8, 1), (8, 8)]:
-        head = QuantileHead(2, Widths(), CVaR())
+        head = QuantileHead(2, NetworkSettings(), CVaR())
         quantiles = head(memory, action, torch.rand(3, tau_steps, 16), torch.rand(3, risk_steps, 1))
         assert quantiles.shape == (3, 8, 16)
-    assert ScalarHead(2, Widths())(memory, action).shape == (3, 8, 1)
+    assert ScalarHead(2, NetworkSettings())(memory, action).shape == (3, 8, 1)
 
 
 def test_broadcast_conditions_equal_repeated_ones() -> None:
@@ -332,4 +341,4 @@ def test_wrong_choices() -> None:
     with pytest.raises(UserInputError, match="scalar critic cannot be conditioned"):
         build_critic(kind="scalar", measure=CVaR())
     with pytest.raises(UserInputError, match="network width head = 0"):
-        Widths(head=0)
+        NetworkSettings(head=0)

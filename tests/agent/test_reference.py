@@ -12,11 +12,12 @@ from torchrl.objectives import SoftUpdate
 
 from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.loss.loss_settings import LossSettings
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.agent.risk import PowerLaw
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 
-SMALL = Widths(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
+SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 
 
@@ -34,15 +35,20 @@ def load_reference() -> ModuleType:
 def make_loss(kind: str, per: str) -> DistributionalSACLoss:
     told = PowerLaw() if kind == "rcdsac" else None
     critic = "scalar" if kind == "sac" else "quantile"
+    over_critics = {"dsac": "mean", "sac": "smaller"}.get(kind, "smaller" if per == "sequence" else "minimum")
     loss = DistributionalSACLoss(
         build_actor(2, VECTOR_OBSERVATIONS, told, SMALL),
         [build_critic(2, VECTOR_OBSERVATIONS, critic, told, SMALL) for _ in range(2)],
+        LossSettings(
+            num_quantiles=5,
+            num_target_quantiles=4,
+            num_risk_samples=3,
+            fractions_per=per,  # type: ignore[arg-type]
+            fraction_sampling="stratified" if per == "sequence" else "uniform",
+            alpha_init=0.2,
+            target_over_critics=over_critics,  # type: ignore[arg-type]
+        ),
         measure=PowerLaw(),
-        num_quantiles=5,
-        num_target_quantiles=4,
-        num_risk_samples=3,
-        fractions_per=per,  # type: ignore[arg-type]
-        alpha_init=0.2,
         generator=torch.Generator().manual_seed(3),
     )
     loss.make_value_estimator(gamma=0.9)
@@ -97,10 +103,6 @@ def gradients_side_by_side(fast: nn.Module, plain: nn.Module) -> list[tuple[Tens
 def test_losses_and_gradients_equal_the_plain_ones(kind: str, per: str, kept: slice) -> None:
     torch.manual_seed(0)
     fast, batch = make_loss(kind, per), make_batch(per, kept)
-    fast.target_over_critics = {"dsac": "mean", "sac": "smaller"}.get(
-        kind, "smaller" if per == "sequence" else "minimum"
-    )
-    fast.fraction_sampling = "stratified" if per == "sequence" else "uniform"
     # The plain losses draw float32 noise as the product does; the generators start equal.
     plain = load_reference().ReferenceLoss(fast, torch.Generator().manual_seed(3)).double()
     SoftUpdate(plain, eps=0.99)

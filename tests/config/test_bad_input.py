@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_run
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.storage.checkpoint import load_weights
 from rcdsac_trl.storage.checkpoint_record import find, folders

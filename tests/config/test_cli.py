@@ -6,16 +6,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from omegaconf import DictConfig
 
 import tiny
 from rcdsac_trl import evaluate, train
-from rcdsac_trl.cli import precheck
+from rcdsac_trl.cli import Command, precheck
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.evaluation_run import EvaluationRun
+from rcdsac_trl.evaluation.measured_run import MeasuredRun
+from rcdsac_trl.report.card import driving_section
 from rcdsac_trl.storage.checkpoint_record import load_progress
 from tiny import ROWS, TINY
 
@@ -38,7 +41,7 @@ def refusal(
         raise AssertionError("it was not refused")
 
     monkeypatch.setattr("rcdsac_trl.training.setup.make_trainer", started)
-    monkeypatch.setattr(EvaluationRun, "run", started)
+    monkeypatch.setattr(MeasuredRun, "run", started)
 
     def call(main: Callable[[], None], arguments: list[str]) -> str:
         monkeypatch.setattr(sys, "argv", ["prog", *arguments])
@@ -98,6 +101,8 @@ def refusal(
         ([POW, "learner.batch_size=-1"], "learner.batch_size=-1 is not a number of at least 1"),
         ([POW, "learner.actor_lr=inf"], "learner.actor_lr=inf must be a number"),
         ([POW, "learner.actor_lr=0"], "learner.actor_lr=0 is not a positive number"),
+        ([POW, "learner.kappa=0"], "learner.kappa=0 is not a positive number"),
+        ([POW, "learner.burn_in=-1"], "learner.burn_in=-1 is not a number of at least 0"),
         ([POW, "learner.gamma=1"], "learner.gamma=1 is outside [0, 1)"),
         ([POW, "learner.target_coefficient=0"], "learner.target_coefficient=0 is outside (0, 1]"),
         ([POW, "learner.num_critics=3"], "learner.num_critics=3 is neither 1 nor 2"),
@@ -134,13 +139,17 @@ def refusal(
         ([POW, "logger.backends=csv"], "logger.backends=csv must be a list of words in brackets"),
         # what does not go together
         (
-            [POW, "collector=single", "world.num_agents=10", "world.num_workers=3"],
+            [POW, "collector=parallel_env", "world.num_agents=10", "world.num_workers=3"],
             "num_workers=3 cannot share 10 agents evenly",
         ),
         ([POW, "world.num_workers=2"], "world.num_workers=2 does nothing with collector=multi: give collector.num_pro"),
         (
             [POW, "collector=single", "+collector.num_processes=2"],
             "collector.num_processes=2 does nothing with collector=single: give world.num_workers",
+        ),
+        (
+            [POW, "collector=parallel_env", "world.num_workers=0"],
+            "world.num_workers=0 leaves collector=parallel_env without workers: give 1 or more, or auto",
         ),
         (
             [POW, "+collector.address=auto"],
@@ -155,16 +164,8 @@ def refusal(
             "collector.num_processes=3 cannot share world.num_agents=10 evenly: give a divisor",
         ),
         (
-            [POW, "+collector.slurm={partition: long, timeout_min: 9}"],
-            "collector.slurm does nothing with collector=multi: take collector=distributed",
-        ),
-        (
-            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 9}"],
-            "collector.num_processes=auto counts the cores of this machine, not SLURM's",
-        ),
-        (
-            [POW, "collector=distributed", "collector.slurm={partition: long, timeout_min: 0}"],
-            "collector.slurm.timeout_min=0 must be at least 1",
+            [POW, "collector=distributed"],
+            "collector=distributed does not exist: choose one of multi, parallel_env, ray",
         ),
         ([POW, "collector.num_processes=-1"], "collector.num_processes=-1 is not a number of processes"),
         ([POW, "world.num_agents=0"], "world.num_agents=0 is below 1"),
@@ -222,8 +223,8 @@ RUN = "run=<the tiny run>"
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ([], "name what to evaluate: either run=<folder> or baseline=pursuit"),
-        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=pursuit"),
+        ([], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
+        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
         (["run=nowhere"], "run=nowhere holds no config.yaml: name a folder that training wrote"),
         (["run=123"], "run=123 must be text or null"),
         ([RUN], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
@@ -259,19 +260,21 @@ RUN = "run=<the tiny run>"
             [RUN, "beta=[-1]", "beta_controller=[clearance]"],
             "beta_controller=[clearance] turns beta between the values of beta: give two or more of them",
         ),
-        ([RUN, "beta=[-2,-1]", "beta_controller=[bandit,bandit]"], "beta_controller=bandit is given more than once"),
         (
-            [RUN, "beta=[-2,-1]", "beta_controller=[mood]"],
-            "beta_controller=['mood'] must be a list of some of clearance, tail_variance, bandit in brackets or null",
+            [RUN, "beta=[-2,-1]", "beta_controller=[clearance,clearance]"],
+            "beta_controller=clearance is given more than once",
+        ),
+        (
+            [RUN, "beta=[-2,-1]", "beta_controller=[bandit]"],
+            "beta_controller=['bandit'] must be a list of some of clearance, tail_variance in brackets or null",
         ),
         (
             [RUN, "beta=[-2,-1]", "controller.near_m=2"],
             "controller.near_m=2 must be above 0 and below controller.far_m=1.2",
         ),
         ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
-        ([RUN, "beta=[-2,-1]", "controller.step_size=0"], "controller.step_size=0 must be above 0"),
-        ([RUN, "beta=[-2,-1]", "controller.exploration=2"], "controller.exploration=2 must be from 0 to 1"),
-        (["baseline=random"], "baseline=random must be pursuit or null"),
+        (["baseline=random"], "baseline=random is unknown: choose one of pursuit, dwa, mppi, or <module>:<class>"),
+        (["baseline=3"], "baseline=3 must be text or null"),
         (["baseline=pursuit", "beta=[-1]"], "baseline=pursuit has neither beta nor collision weight: leave them out"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -331,6 +334,37 @@ def test_what_only_shows_something_is_left_to_hydra(flag: str) -> None:
     precheck("train", [flag], never)
 
 
+# ------------------------------------------------------------------------------------------------ verbs
+def test_a_command_makes_its_object_of_the_config_and_runs_it_with_what_describes_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")
+    monkeypatch.setattr(sys, "argv", ["calibrate", "num_maps=7"])
+    done: list[object] = []
+
+    class Made:
+        def run(self, *given: object) -> None:
+            done.extend(given)
+
+    def make(cfg: DictConfig) -> Made:
+        done.append(cfg.num_maps)
+        return Made()
+
+    Command("calibrate", make, describe="rcdsac_trl.report.card:driving_section")()
+    assert done == [7, 7, driving_section]  # checked before Hydra begins, and made then
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "course", "evaluate", "export", "publish", "search"])
+def test_what_a_verb_names_exists(verb: str) -> None:
+    command = import_module(f"rcdsac_trl.{verb}").main
+    assert command.name == verb
+    for named in filter(None, (command.make, getattr(command, "describe", None))):
+        module, _, function = named.partition(":")
+        assert callable(getattr(import_module(module), function))
+
+
 # ------------------------------------------------------------------------------------------------ whole processes
 def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
@@ -345,10 +379,10 @@ def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def test_a_refusal_of_the_real_program(tmp_path: Path) -> None:
-    process = start(tmp_path, "rcdsac_trl.train", POW, "learner.batch_size=abc")
+    process = start(tmp_path, "rcdsac_trl.evaluate", "bta=[-1]")  # told before torch is imported
     out, err = process.communicate(timeout=300)
     assert (process.returncode, out) == (2, "")
-    assert err == "rcdsac_trl: learner.batch_size=abc must be a whole number\n"
+    assert err == "rcdsac_trl: there is no key bta: did you mean beta?\n"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -401,7 +435,7 @@ def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -
 @pytest.mark.parametrize(
     "processes",
     [
-        ["collector=single", "world.num_workers=2"],
+        ["collector=parallel_env", "world.num_workers=2"],
         ["collector.num_processes=2"],
         ["validation.processes=1", "validation.every_iterations=2", "task.episode_steps=1000"],
         ["collector=ray", "collector.num_processes=2"],

@@ -14,7 +14,7 @@ from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings
-from rcdsac_trl.config.run_config import evaluation_settings, training_settings
+from rcdsac_trl.config.run_config import agent_of_run, read_config, settings_of_run, training_settings
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.config.typed import read
@@ -327,15 +327,11 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             "learner.max_grad_norm=1.0",
         ).run()
     # What would start processes on other machines is told all that is chosen of them.
-    for name, teams, given in (
-        ("ray", "ray_workers.RayTeams", "collector.address=auto"),
-        ("distributed", "distributed_workers.DistributedTeams", "collector.slurm={partition: long, timeout_min: 9}"),
-    ):
-        monkeypatch.setattr(f"rcdsac_trl.rollout.{teams}", lambda *_, **__: None)
-        settings = tiny_settings("sac", f"collector={name}", "collector.num_processes=2", given)
-        make_episodes(settings, make_actor(settings), "cpu", Progress())
+    monkeypatch.setattr("rcdsac_trl.rollout.ray_workers.RayTeams", lambda *_, **__: None)
+    settings = tiny_settings("sac", "collector=ray", "collector.num_processes=2", "collector.address=auto")
+    make_episodes(settings, make_actor(settings), "cpu", Progress())
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")
-    turned = "beta_controller=[clearance,tail_variance,bandit]"
+    turned = "beta_controller=[clearance,tail_variance]"
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
     evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5")
@@ -350,7 +346,7 @@ def test_every_leaf_of_the_root_is_a_field(root: str) -> None:
     if root == "train":
         settings = training_settings(compose("train", ["+algo=rcdsac_pow", "preset=paper"]))
     else:
-        settings = evaluation_settings(compose("evaluate", ["baseline=pursuit"]))
+        settings = read_config(compose("evaluate", ["baseline=pursuit"]), EvaluationSettings)
     values = {k: v for k, v in yaml_of(f"{root}.yaml").items() if k not in ("defaults", "hydra")}
     found = list(leaves(values))
     assert len(found) > 10
@@ -459,3 +455,13 @@ def test_replay_holds_an_iteration_and_is_no_larger_than_the_run_can_fill() -> N
     assert tiny_settings("sac", "replay.capacity_steps=40").replay_steps == 40
     with pytest.raises(UserInputError, match=r"capacity_steps=39 does not hold the 40 steps of one iteration"):
         composed("+algo=sac", *TINY, "replay.capacity_steps=39")
+
+
+def test_runs_that_do_not_say_how_they_pad_do_not(tmp_path: Path) -> None:
+    cfg = compose("train", ["+algo=rcdsac_pow"])
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    assert agent_of_run(tmp_path).network.padding == settings_of_run(tmp_path).network.padding == "circular"
+    OmegaConf.set_struct(cfg, False)
+    del cfg.network["padding"]
+    OmegaConf.save(cfg, tmp_path / "config.yaml")
+    assert agent_of_run(tmp_path).network.padding == settings_of_run(tmp_path).network.padding == "none"

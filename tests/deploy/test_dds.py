@@ -32,7 +32,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from rcdsac_trl.deploy.ros import dds_types as ros
-from rcdsac_trl.deploy.ros.dds_bridge import READS, WRITES, DdsBridge
+from rcdsac_trl.deploy.ros.dds_bridge import READS, UNSTAMPED, WRITES, DdsBridge
 
 PERIOD_S = 0.14
 # Its own domain and tag: whatever else speaks DDS on this machine or beside it is not met. No multicast, loopback only.
@@ -80,7 +80,7 @@ def same(theirs: Any, ours: Any) -> None:
         np.testing.assert_equal(ours, theirs)
 
 
-@pytest.mark.parametrize("kind", [*READS.values(), *WRITES.values()], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*READS.values(), *WRITES.values(), UNSTAMPED], ids=lambda kind: kind.__name__)
 @pytest.mark.parametrize("release", ["ROS2_FOXY", "ROS2_HUMBLE", "ROS2_JAZZY"])
 def test_types_and_bytes_are_those_of_ros(kind: Any, release: str) -> None:
     typesys = pytest.importorskip("rosbags.typesys")
@@ -224,6 +224,49 @@ def test_word_that_there_is_nothing_more_is_no_message() -> None:
     assert "scan_s is 0.40 s old" in str(bridge.step(10.4).reason)
 
 
+# ------------------------------------------------------------------------------------------------ who is there
+def endpoint(make: Any, name: str, kind: Any, *rules: Any) -> Any:
+    participant = DomainParticipant(DOMAIN)
+    return make(participant, Topic(participant, f"rt/{name}", kind), Qos(*rules))
+
+
+def test_a_base_that_reads_twist_gets_the_same_commands() -> None:
+    robot, bridge = Robot(), DdsBridge(Driver(Policy(agent())), DOMAIN)
+    base = endpoint(DataReader, "cmd_vel", ros.Twist, Rule.Reliability.Reliable(10**9), Rule.History.KeepLast(10))
+    robot.say(scan=laser(10.0), odom=odometry(10.0), plan=plan(10.0))
+    command = bridge.step(10.0)
+    assert command.fresh
+    bridge.leave(10.1)
+    expected = [(command.v_m_per_s, command.omega_rad_per_s), (0.0, 0.0)]
+    assert [(twist.linear.x, twist.angular.z) for twist in base.take(10)] == expected
+    assert robot.commands() == expected
+
+
+def test_it_says_who_reads_its_commands_and_who_writes_what_it_needs() -> None:
+    bridge = DdsBridge(Driver(Policy(agent())), DOMAIN, remapped={"cmd_vel": "/base/cmd_vel"})
+    kinds = "geometry_msgs/msg/Twist and geometry_msgs/msg/TwistStamped"
+    nobody = (
+        f"nobody reads /base/cmd_vel (written as {kinds}); nobody writes /scan (sensor_msgs/msg/LaserScan); "
+        "nobody writes /odom (nav_msgs/msg/Odometry); nobody writes /plan (nav_msgs/msg/Path)"
+    )
+    assert bridge.report() == nobody
+    others = [
+        endpoint(DataReader, "base/cmd_vel", ros.Twist),
+        endpoint(DataWriter, "scan", ros.Odometry),
+        endpoint(DataWriter, "odom", ros.Odometry, Rule.Reliability.BestEffort),
+        endpoint(DataWriter, "plan", ros.Path, Rule.Reliability.BestEffort),
+    ]
+    assert bridge.report() == (
+        "/base/cmd_vel is read as geometry_msgs/msg/Twist; /scan is written as nav_msgs/msg/Odometry, and read as "
+        "sensor_msgs/msg/LaserScan; /plan is written with less quality of service than is asked for: make its writer "
+        "reliable"
+    )
+    others[0] = endpoint(DataReader, "base/cmd_vel", ros.Float64)
+    assert bridge.report().startswith(f"/base/cmd_vel is read as std_msgs/msg/Float64, and written as {kinds};")
+    del others
+    assert bridge.report() == nobody
+
+
 # ------------------------------------------------------------------------------------------------ the program
 def decided() -> Weights:
     """Make an agent that knows what it wants: beta turns it from right to left, and it takes few steps to settle."""
@@ -242,6 +285,8 @@ def folder(tmp_path: Path) -> Path:
     ("arguments", "variables", "said"),
     [
         (["nobody"], {}, "nobody"),
+        (["--laser", "150", "0", "0"], {}, "x_m=150, y_m=0 is more than 1 m from the robot's centre: give metres"),
+        (["--laser", "0", "0", "90"], {}, "yaw_rad=90 of a sensor is more than a full turn: give radians"),
         (["--beta", "3"], {}, r"beta=3 is outside \[-2, 0\]"),
         (["--remap", "scan"], {}, r"--remap scan cannot be read: write <name>:=<topic>"),
         (["--remap", "scam:=scan"], {}, "scam:=scan renames what there is not: choose one of scan, odom, plan"),
@@ -284,6 +329,54 @@ def test_without_cyclonedds_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UserInputError, match=r"pip install 'rcdsac-trl\[dds\]'"):
         dds_node.bridge_of(dds_node._parser().parse_args(["anybody"]))
+
+
+def test_zeros_are_open_space_where_the_command_line_says_so(folder: Path) -> None:
+    for arguments, reads_zero in (([], True), (["--zero-means", "nothing"], False)):
+        bridge = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), *arguments]))
+        robot = Robot()
+        message = laser(10.0)
+        message.ranges = [0.0] * 360
+        robot.say(scan=message, odom=odometry(10.0), plan=plan(10.0))
+        assert ("read 0" in str(bridge.step(10.0).reason)) == reads_zero
+
+
+class Told:
+    """Stands in for a bridge whose reader comes after 3 s, and ends the program after 50 steps."""
+
+    def __init__(self) -> None:
+        self.topics = {"scan": "scan"}
+        self.driver = Driver(Policy(agent(period_s=(0.0, 0.0))))
+        self.steps = 0
+
+    def step(self, now_s: float) -> Any:
+        self.steps += 1
+        if self.steps == 50:
+            signal.raise_signal(signal.SIGTERM)
+        return self.driver.policy.refuse("there is no scan yet")
+
+    def report(self) -> str:
+        return "nobody reads /cmd_vel" if self.steps < 25 else "/cmd_vel is read as geometry_msgs/msg/Twist"
+
+    def leave(self, now_s: float) -> None:
+        self.steps = -1
+
+
+def test_the_program_tells_who_reads_it_whenever_that_changes(capsys: pytest.CaptureFixture[str]) -> None:
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    bridge: Any = Told()
+    try:
+        dds_node.drive(bridge)
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    assert bridge.steps == -1
+    assert capsys.readouterr().err.splitlines() == [
+        "topics: /scan; Ctrl-C ends it",
+        "there is no scan yet; it drives on with the next good input",
+        "nobody reads /cmd_vel",
+        "/cmd_vel is read as geometry_msgs/msg/Twist",
+    ]
 
 
 # ------------------------------------------------------------------------------------------------ two processes

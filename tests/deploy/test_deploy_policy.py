@@ -36,7 +36,7 @@ def row(tensor_like: Any) -> torch.Tensor:
 def test_it_drives_as_torch_and_the_world_say(name: str, sensor: str) -> None:
     weights = full_size(**ROWS[name], sensor=sensor)
     policy = Policy(weights, guard=None)
-    actor, critics = ActorStep(weights), CriticStep(weights, torch.from_numpy(policy.fractions))
+    actor, critics = ActorStep.of_weights(weights), CriticStep(weights, torch.from_numpy(policy.fractions))
     memory, memories = torch.zeros(1, 128), torch.zeros(2, 1, 128)
     rng = np.random.default_rng(1)
     commanded = (0.0, 0.0)

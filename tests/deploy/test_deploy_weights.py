@@ -9,22 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule
 
 import rcdsac_trl
-from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.deploy import Policy, find_weights, read_weights, shipped_names
 from rcdsac_trl.deploy.policy.weights import Weights, packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.run_weights import weights_of_run
-from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.storage import checkpoint_record
-from rcdsac_trl.storage.checkpoint import Checkpoints
-from rcdsac_trl.storage.checkpoint_record import Progress
-from rcdsac_trl.training import run_log
 from robots import AHEAD, OPEN, ROWS, STANDING, agent
-from tiny import tiny_cfg
+from tiny import untrained_run
 
 
 def written(folder: Path, weights: Weights) -> Path:
@@ -71,8 +65,9 @@ def test_damage_is_refused_in_one_sentence(tmp_path: Path) -> None:
     config.write_text("[]")
     assert "cannot be read" in refusal()
     for key, value, told in [
-        ("format_version", 99, "is of format 99, this version reads 1"),
+        ("format_version", 99, "is of format 99, this version reads 1 and 2"),
         ("sensor", "wide", "sensor='wide' does not exist"),
+        ("padding", "zeros", "neither 'circular' nor 'none'"),
         ("critic", "none", "neither 'quantile' nor 'scalar'"),
         ("num_critics", 3, "differ in critics.2"),
         ("context", "mood", "neither 'beta' nor 'collision_weight'"),
@@ -80,6 +75,10 @@ def test_damage_is_refused_in_one_sentence(tmp_path: Path) -> None:
         ("network", {"conv": 0}, "does not give a positive width"),
         ("network", values["network"] | {"head": 9}, "its config.json says float32"),
         ("period_s", [0.1], "not two finite numbers"),
+        ("period_s", [120.0, 160.0], "does not rise within [0, 10]: give seconds"),
+        ("period_s", [0.16, 0.12], "does not rise within"),
+        ("waypoint_radius_m", 500.0, "is not above 0 and at most 20: give metres"),
+        ("goal_radius_m", 0.0, "is not above 0"),
     ]:
         config.write_text(json.dumps(values | {key: value}))
         assert told in refusal(), key
@@ -122,21 +121,6 @@ print(sorted(heavy & {{name.split(".")[0] for name in sys.modules}}))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
-
-
-def untrained_run(folder: Path, row: str, *overrides: str) -> tuple[Path, LossModule, AveragedModel]:
-    """Write a run folder whose agent has its first weights, the average moved a little so that one can tell."""
-    cfg = tiny_cfg(row, *overrides)
-    trained = training_settings(cfg)
-    loss = make_loss(trained, "cpu")
-    average = make_average(loss, trained.learner)
-    with torch.no_grad():
-        for parameter in average.parameters():
-            parameter += 0.01
-    run_log.start_run_folder(folder, cfg, {})
-    components = {"loss": loss, "average": average}
-    Checkpoints(folder / "checkpoints", components, replay=None, keep=1).save(Progress(updates=7), {})
-    return folder, loss, average
 
 
 @pytest.mark.parametrize("row", ["rcwr", "sac", "dsac_cvar", "rcdsac_cvar"])

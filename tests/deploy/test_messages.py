@@ -168,7 +168,7 @@ def test_it_stands_until_it_has_everything_and_says_what_is_missing() -> None:
     ):
         told.append(driver.command(10.0).reason.split(";")[0])
         give()
-    assert told == ["there is no odometry yet", "there is no path yet", "there is no scan, or not of every camera, yet"]
+    assert told == ["there is no odometry yet", "there is no path yet", "there is no scan yet"]
     assert driver.command(10.1).fresh
     driver.on_path(path(10.1, []))
     assert "there is no path yet" in driver.command(10.1).reason

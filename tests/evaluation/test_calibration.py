@@ -6,13 +6,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 import tiny
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.calibration import fractions, predict, roll_out
-from rcdsac_trl.evaluation.make_calibration import make_calibration
+from rcdsac_trl.evaluation.branches import fractions, predict, roll_out
+from rcdsac_trl.evaluation.calibration import make_calibration
 from rcdsac_trl.report import calibration_report as measured
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.make_agent import make_loss
@@ -178,23 +179,16 @@ def test_calibration_by_hand() -> None:
 
 
 # ------------------------------------------------------------------------------------------------ the command
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("calibrated") / "run"
-    tiny.tiny_trainer(folder).run()
-    return folder
-
-
 def calibrate(run: Path, *overrides: str):
     given = [f"run={run}", "num_states=2", "num_rollouts=2", "horizon_steps=8", "threads=1", *overrides]
     return make_calibration(compose("calibrate", given))
 
 
-def test_a_calibration_writes_the_same_whoever_drives(run: Path, tmp_path: Path) -> None:
+def test_a_calibration_writes_the_same_whoever_drives(tiny_run: Path, tmp_path: Path) -> None:
     outs = []
     for workers in (0, 2):
         calibration = calibrate(
-            run, "beta=[-2,0]", "num_maps=2", f"num_workers={workers}", f"out={tmp_path / str(workers)}"
+            tiny_run, "beta=[-2,0]", "num_maps=2", f"num_workers={workers}", f"out={tmp_path / str(workers)}"
         )
         calibration.run()
         outs.append(calibration.results.path)
@@ -209,13 +203,13 @@ def test_a_calibration_writes_the_same_whoever_drives(run: Path, tmp_path: Path)
     assert (outs[0] / "calibration.png").stat().st_size > 10_000
 
 
-def test_what_cannot_be_calibrated_is_refused(run: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_calibrated_is_refused(tiny_run: Path, tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="drives as its beta says"):
-        calibrate(run)
+        calibrate(tiny_run)
     with pytest.raises(UserInputError, match=r"horizon_steps=20 must be below the 20 steps"):
-        calibrate(run, "beta=[-1]", "horizon_steps=20")
+        calibrate(tiny_run, "beta=[-1]", "horizon_steps=20")
     with pytest.raises(UserInputError, match="run=<folder>"):
         make_calibration(compose("calibrate", []))
-    tiny.tiny_trainer(tmp_path / "sac", "sac").run()
+    OmegaConf.save(tiny.tiny_cfg("sac"), tmp_path / "config.yaml", resolve=True)
     with pytest.raises(UserInputError, match="scalar critics"):
-        calibrate(tmp_path / "sac")
+        calibrate(tmp_path)

@@ -17,9 +17,9 @@ import pytest
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
 from rcdsac_trl.deploy import Policy
+from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
-from rcdsac_trl.deploy.policy.policy import Command
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.deploy.sensors.sectors import Sectors
 from rcdsac_trl.errors import UserInputError
@@ -34,7 +34,7 @@ from rcdsac_trl.evaluation.course.course_drive import (
     start_pose,
 )
 from rcdsac_trl.evaluation.course.course_film import frames
-from rcdsac_trl.evaluation.course.make_course import make_course
+from rcdsac_trl.evaluation.course.course_run import make_course
 from rcdsac_trl.evaluation.course.odometry import Odometry
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
 from rcdsac_trl.report.course_table import course_table, paper_course, write_course
@@ -312,7 +312,7 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
 
 
 def test_without_a_shipped_agent_somebody_must_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module = importlib.import_module("rcdsac_trl.evaluation.course.make_course")
+    module = importlib.import_module("rcdsac_trl.evaluation.course.entries")
     monkeypatch.setattr(module, "shipped_names", lambda: [])
     with pytest.raises(UserInputError, match="name who drives"):
         make_course(compose("course", given(tmp_path)))

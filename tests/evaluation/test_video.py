@@ -12,20 +12,20 @@ import pandas as pd
 import pytest
 import torch
 from PIL import Image
-from test_render import SIZE_M, scene
 
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.errors import FaultError, UserInputError
-from rcdsac_trl.evaluation.calibration import predict
+from rcdsac_trl.evaluation.branches import predict
+from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.evaluation.film import filming, video
 from rcdsac_trl.evaluation.film.episode_film import Track, film
 from rcdsac_trl.evaluation.film.recording import Moment
-from rcdsac_trl.evaluation.film.trajectories import ways
+from rcdsac_trl.evaluation.film.trajectories import trajectories
 from rcdsac_trl.evaluation.film.video import Frame, write_video
-from rcdsac_trl.evaluation.make_evaluation import make_evaluation
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
 from rcdsac_trl.world.render import FLOOR, MAPPED, ROBOT, TOUCHING
+from still_scene import SIZE_M, scene
 from tiny import STEPS, evaluate, tiny_settings
 
 
@@ -144,7 +144,7 @@ def test_ways_show_goals_and_contacts_where_they_were() -> None:
 
     free = Track("a", [at(2.5, 10.0), at(4.5, 10.0), at(6.5, 10.0)])
     hit = Track("b", [at(2.5, 10.0), at(4.5, 10.0, collisions=1), at(6.5, 10.0, 1), at(8.5, 10.0, 1, goals=1)])
-    picture = ways([free, hit])
+    picture = trajectories([free, hit])
     side, head = 560, 56
     assert picture.shape == (side + 3 * head, 2 * side, 3)
     scale = side / (1.04 * SIZE_M)

@@ -12,8 +12,9 @@ from omegaconf import OmegaConf
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.experiments.launchers import LAUNCHERS, read_launcher
-from rcdsac_trl.experiments.make_sweep import make_sweep
 from rcdsac_trl.experiments.sweep import Job, Launcher, Sweep
+from rcdsac_trl.experiments.sweep_jobs import make_sweep
+from rcdsac_trl.system import cgroups
 from rcdsac_trl.system.cores import SHARE, usable_cores
 from rcdsac_trl.system.processes import resolve_num_workers
 
@@ -90,10 +91,11 @@ def test_slurm_is_asked_for_what_was_chosen_and_its_refusal_is_told(
     program(programs, "srun", "")
     program(programs, "sbatch", f'cp "$1" {tmp_path}/asked.sh; echo "invalid partition" >&2; exit 1')
     monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
-    chosen = ["partition=long", "cores_per_run=3", "gpus_per_run=1", "mem_gb=5", "timeout_min=90", "runs_at_once=1"]
-    chosen += ["setup=['module load python']", "sbatch=['constraint=a100']", "account=lab"]
+    chosen = ["partition=long", "cores_per_run=3", "gpus_per_run=1", "timeout_min=90", "runs_at_once=1"]
+    extra = ["slurm_setup=['module load python']", "slurm_additional_parameters={constraint: a100}"]
+    extra += ["slurm_account=lab", "mem_gb=5"]
     jobs = [job(tmp_path / "all", name, FAILS) for name in ("a", "b")]
-    slurm = launcher("slurm", *(f"launcher.{each}" for each in chosen))
+    slurm = launcher("slurm", *(f"launcher.{each}" for each in chosen), *(f"++launcher.extra.{each}" for each in extra))
     with pytest.raises(FaultError, match=r"^launcher=slurm: .*"):
         Sweep(tmp_path / "all", "two", jobs, slurm).run()
     asked = (tmp_path / "asked.sh").read_text().splitlines()
@@ -117,16 +119,21 @@ def test_slurm_is_asked_for_what_was_chosen_and_its_refusal_is_told(
         ("joblib", ["cores_per_run=0"], "launcher.cores_per_run=0 must be at least 1"),
         ("joblib", ["runs_at_once=0"], "launcher.runs_at_once=0 must be at least 1"),
         ("joblib", ["runs_at_once=all"], "launcher.runs_at_once=all must be a whole number or auto"),
-        ("slurm", ["mem_gb=0"], "launcher.mem_gb=0 must be at least 1"),
+        ("slurm", ["runs_at_once=0"], "launcher.runs_at_once=0 must be at least 1"),
         ("slurm", ["cluster=pbs"], "launcher.cluster=pbs must be one of slurm, local"),
-        ("slurm", ["sbatch=[exclusive]"], "launcher.sbatch=exclusive is no option of sbatch: write it as <name>=<val"),
+        ("slurm", ["extra.mem_gb=much"], 'launcher.extra is not what submitit takes: Parameter "mem_gb" expected type'),
+        (
+            "slurm",
+            ["extra.queue=lab"],
+            "launcher.extra is not what submitit takes: Parameter 'queue' need to be pr",
+        ),
         ("ray", ["gpus_per_run=-1"], "launcher.gpus_per_run=-1 must be at least 0"),
         ("local", ["name=cloud"], "launcher.name=cloud is unknown: choose one of local, joblib, slurm, ray"),
         ("local", ["cores=1"], "there is no key launcher.cores"),
     ],
 )
 def test_what_no_launcher_can_do_is_refused(name: str, overrides: list[str], sentence: str) -> None:
-    given = [f"{'+' if each == 'cores=1' else ''}launcher.{each}" for each in overrides]
+    given = [f"++launcher.{each}" for each in overrides]
     with pytest.raises(UserInputError) as caught:
         launcher(name, *given)
     assert str(caught.value).startswith(sentence)
@@ -152,6 +159,7 @@ def test_every_launcher_has_its_file() -> None:
 
 def test_a_share_of_the_cores_is_what_every_auto_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(cgroups, "processor_quota", lambda: None)
     monkeypatch.delenv(SHARE, raising=False)
     assert usable_cores() == 8
     monkeypatch.setenv(SHARE, "5")

@@ -9,8 +9,8 @@ import pytest
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.experiments import optuna_search as search
-from rcdsac_trl.experiments.make_search import make_search
-from rcdsac_trl.experiments.optuna_search import Choice, Number, Search
+from rcdsac_trl.experiments.optuna_search import Search, make_search
+from rcdsac_trl.experiments.search_space import Choice, Number
 from rcdsac_trl.experiments.sweep import Job, State
 from tiny import SMALL, Calls
 
@@ -44,6 +44,9 @@ def trained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable:
             what = left.pop(0)
             if isinstance(what, State):
                 return what
+            if callable(what):
+                what()
+                return State("interrupted")
             assert isinstance(what, list)
             for done in range(1, len(what) + 1):
                 write(job.folder, what[:done])
@@ -114,6 +117,66 @@ def test_a_killed_search_goes_on_with_the_trial_that_was_lost(trained: Callable)
     assert sorted(again._done()) == ["trial-0000", "trial-0001", "trial-0003"]
     trained()
     made("search.trials=3").run()  # nothing is left to do
+
+
+def test_a_search_whose_journal_was_cut_goes_on(trained: Callable, capsys: pytest.CaptureFixture) -> None:
+    """The disk filled up while the first trial's end was written: that trial is taken up again."""
+    jobs = trained(GOOD)
+    made("search.trials=1").run()
+    journal = Path("multirun/search-mine/optuna.journal")
+    journal.write_bytes(journal.read_bytes()[:-30])
+    more = trained(GOOD, GOOD)
+    again = made("search.trials=2")
+    again.run()
+    assert f"the last line of {journal.absolute()} was cut" in capsys.readouterr().err
+    assert [job.name for job in more] == ["trial-0000", "trial-0002"]
+    assert more[0].overrides == jobs[0].overrides
+    assert [trial.state.name for trial in again.study.trials] == ["FAIL", "COMPLETE", "COMPLETE"]
+
+
+def test_a_row_that_is_being_written_is_worth_nothing_yet(trained: Callable, tmp_path: Path) -> None:
+    write(tmp_path, GOOD)
+    table = tmp_path / "validation_episodes.csv"
+    whole = table.read_bytes()
+    table.write_bytes(whole + b"3,3,,1")  # 1000.0 to be
+    assert made()._values(tmp_path) == {1: 90.0, 2: 180.0, 3: 290.0}
+    table.write_bytes(whole[:8])
+    assert made()._values(tmp_path) == {}
+
+
+def test_a_trial_whose_search_lives_is_nobody_elses(trained: Callable) -> None:
+    """From its first moment on: the training that it starts takes its own lock only seconds later."""
+    others: list[str] = []
+
+    def look() -> None:
+        other = made("search.trials=9")
+        other._take_up_what_was_lost()
+        others.extend(trial.state.name for trial in other.study.trials)
+
+    trained(look)
+    with pytest.raises(KeyboardInterrupt):
+        made("search.trials=1").run()
+    assert others == ["RUNNING"]
+    look()
+    assert others[1:] == ["FAIL", "WAITING"]
+    look()
+    assert others[3:] == ["FAIL", "WAITING"]
+
+
+def test_a_search_that_was_killed_between_two_lines_starts_no_trial_twice(trained: Callable) -> None:
+    trained(State("interrupted"))
+    with pytest.raises(KeyboardInterrupt):
+        made("search.trials=1").run()
+    made("search.trials=1")._take_up_what_was_lost()
+    journal = Path("multirun/search-mine/optuna.journal")
+    *before, last = journal.read_bytes().splitlines(keepends=True)
+    assert b'"state":3' in last  # that the lost one has failed
+    journal.write_bytes(b"".join(before))
+    jobs = trained(GOOD)
+    again = made("search.trials=1")
+    again.run()
+    assert [job.name for job in jobs] == ["trial-0000"]
+    assert [trial.state.name for trial in again.study.trials] == ["FAIL", "COMPLETE"]
 
 
 def test_storage_may_be_a_database(trained: Callable) -> None:

@@ -13,8 +13,8 @@ import pytest
 
 from rcdsac_trl.config.compose import choices
 from rcdsac_trl.errors import FaultError, UserInputError
-from rcdsac_trl.experiments.make_sweep import check_single, make_sweep
 from rcdsac_trl.experiments.sweep import Job, State, runs_of
+from rcdsac_trl.experiments.sweep_jobs import check_single, make_sweep
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import load_progress
 from tiny import SMALL, Calls, first_combinations_only, yaml_of

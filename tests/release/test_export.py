@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_deploy_weights import untrained_run
 
 import rcdsac_trl
 from rcdsac_trl.config.compose import compose
@@ -19,7 +18,9 @@ from rcdsac_trl.deploy.policy.weights import packed, read_weights
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.release.agent_export import Export, make_export
 from robots import AHEAD, OPEN, ROWS, STANDING, full_size
+from tiny import untrained_run
 
+onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
 torch.set_num_threads(1)
@@ -62,6 +63,13 @@ def test_the_command_writes_a_folder_that_load_reads(
     loaded = rcdsac_trl.load(out).act(OPEN, AHEAD, STANDING, -2.0)
     assert loaded.wanted == Policy(export.weights).act(OPEN, AHEAD, STANDING, -2.0).wanted
     assert packed(read_weights(out)) == packed(export.weights)
+    # What docs/robot.md says of them: ONNX Runtime 1.18 is the first that reads these versions, and batches are of 1.
+    for name in ("actor.onnx", "critics.onnx"):
+        model = onnx.load(out / name)
+        assert (model.ir_version, [(opset.domain, opset.version) for opset in model.opset_import]) == (10, [("", 20)])
+        sizes = {given.name: [dim.dim_value for dim in given.type.tensor_type.shape.dim] for given in model.graph.input}
+        assert sizes["range"] == [1, 180]
+        assert sizes.get("memory", [1])[0] == sizes.get("memories", [2, 1])[1] == 1
     with pytest.raises(UserInputError, match="is not empty"):
         make_export(compose("export", asked))
 

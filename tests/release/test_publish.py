@@ -10,7 +10,7 @@ import rcdsac_trl
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.deploy.policy.weights import halved, packed, read_weights
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.release.make_publication import make_publication
+from rcdsac_trl.release.publication import make_publication
 from rcdsac_trl.report.card import driving_section
 from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.read import read_episodes
@@ -24,9 +24,9 @@ def evaluated(tiny_run: Path) -> Path:
     return tiny_run
 
 
-def publish(evaluated: Path, folder: Path) -> list[str]:
+def publish(evaluated: Path, folder: Path) -> None:
     given = [f"runs=[{evaluated}]", f"weights={folder / 'weights'}", f"results={folder / 'results'}"]
-    return list(make_publication(compose("publish", given)).run(driving_section))
+    make_publication(compose("publish", given)).run(driving_section)
 
 
 def test_half_precision_is_read_as_single(tmp_path: Path) -> None:
@@ -45,9 +45,11 @@ def test_half_precision_is_read_as_single(tmp_path: Path) -> None:
         halved(type(weights)(weights.config, big))
 
 
-def test_what_is_published_drives_and_is_reported_on(evaluated: Path, tmp_path: Path) -> None:
-    (said,) = publish(evaluated, tmp_path)
-    assert said.startswith("rcdsac_pow-narrow: ")
+def test_what_is_published_drives_and_is_reported_on(
+    evaluated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    publish(evaluated, tmp_path)
+    assert capsys.readouterr().out.startswith("rcdsac_pow-narrow: ")
     folder = tmp_path / "weights" / "rcdsac_pow-narrow"
     assert {path.name for path in folder.iterdir()} == {"README.md", "config.json", "weights.safetensors"}
     command = rcdsac_trl.load(folder, guard=None).act(OPEN, AHEAD, STANDING, -1.0)

@@ -8,7 +8,8 @@ from PIL import Image
 from rcdsac_trl import draw_maps
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.plot_training import PANELS, best_updates, check, draw_run, learning_curve, validation_curves
+from rcdsac_trl.plot_training import _read_run, best_updates, draw_run, main
+from rcdsac_trl.report.learning_curve import PANELS, learning_curve, validation_curves
 from rcdsac_trl.rollout.metrics import METRICS
 
 NAN = float("nan")
@@ -68,7 +69,7 @@ def test_the_best_checkpoint_has_the_highest_mean_over_the_conditions() -> None:
 
 @pytest.mark.parametrize(("table", "lines"), [(None, 1), (TWO_BETAS, 4)])  # training, two betas, the best checkpoint
 def test_every_panel_shows_every_curve(table: pd.DataFrame | None, lines: int) -> None:
-    figure = learning_curve("title", TRAINING, table, 1000)
+    figure = learning_curve("title", TRAINING, table, None if table is None else best_updates(table, 1000))
     *panels, legend = figure.axes
     assert [axes.get_title(loc="left") for axes in panels] == list(PANELS.values())
     assert {len(axes.get_lines()) for axes in panels} == {lines}
@@ -78,7 +79,7 @@ def test_every_panel_shows_every_curve(table: pd.DataFrame | None, lines: int) -
 def test_a_disastrous_iteration_does_not_flatten_the_reward() -> None:
     steady = validation(NAN, NAN, {updates: [300.0, 302.0] for updates in range(1, 61)})
     spoilt = steady.assign(reward=steady["reward"].where(steady["updates"] != 2, -1000.0))
-    low, high = learning_curve("title", spoilt, None, 1000).axes[0].get_ylim()
+    low, high = learning_curve("title", spoilt, None).axes[0].get_ylim()
     assert 290.0 < low < 301.0 < high < 310.0
 
 
@@ -108,9 +109,9 @@ def test_draws_a_run_before_and_after_its_first_validation(run: Path) -> None:
 def test_refuses_what_it_cannot_draw(run: Path, tmp_path: Path) -> None:
     def refused(match: str, *overrides: str) -> None:
         with pytest.raises(UserInputError, match=match):
-            check(compose("plot_training", list(overrides)))
+            main.check(compose("plot_training", list(overrides)))
 
-    check(compose("plot_training", [f"run={run}"]))
+    main.check(compose("plot_training", [f"run={run}"]))
     refused("name what to draw: run=<folder>")
     refused(r"holds no config\.yaml: name a folder that training wrote", f"run={tmp_path}")
     refused(r"out=.*picture\.jpg does not name a PNG file", f"run={run}", f"out={run}/picture.jpg")
@@ -125,28 +126,43 @@ def test_refuses_what_it_cannot_draw(run: Path, tmp_path: Path) -> None:
         ("config.yaml", bytes(range(256)), r"config\.yaml cannot be read \(.*decode.*\): name a folder"),
         ("config.yaml", b"algo: 3", r"config\.yaml cannot be read \("),
         ("config.yaml", b"", r"config\.yaml cannot be read \("),
-        ("training_episodes.csv", b"", r"training_episodes\.csv cannot be read \(No columns"),
+        ("training_episodes.csv", b"", r"training_episodes\.csv holds no episode: wait for one"),
+        ("training_episodes.csv", b"updates,rewa", r"training_episodes\.csv holds no episode: wait for one"),
         ("training_episodes.csv", b"a,b\n1,2\n", r"training_episodes\.csv cannot be read \(no column updates"),
         ("training_episodes.csv", bytes(range(256)), r"training_episodes\.csv cannot be read \("),
-        ("validation_episodes.csv", b"updates\n1\n2,3", r"validation_episodes\.csv cannot be read \(Error tokenizing"),
+        (
+            "validation_episodes.csv",
+            b"updates\n1\n2,3\n",
+            r"validation_episodes\.csv cannot be read \(Error token",
+        ),
     ],
 )
 def test_a_damaged_run_is_refused_in_one_sentence(run: Path, name: str, content: bytes, told: str) -> None:
     (run / name).write_bytes(content)
     with pytest.raises(UserInputError, match=told):
-        check(compose("plot_training", [f"run={run}"]))
+        main.check(compose("plot_training", [f"run={run}"]))
+
+
+def test_a_row_that_is_being_written_is_left_out(run: Path) -> None:
+    """Cut anywhere: a number without its end is another number."""
+    whole = (run / "training_episodes.csv").read_bytes()
+    _, before, _, _ = _read_run(run)
+    lines = whole.splitlines(keepends=True)
+    for kept in range(len(lines[-1])):
+        (run / "training_episodes.csv").write_bytes(b"".join(lines[:-1]) + lines[-1][:kept])
+        pd.testing.assert_frame_equal(_read_run(run)[1], before[:-1])
 
 
 @pytest.mark.parametrize("name", ["training_episodes.csv", "validation_episodes.csv"])
 def test_a_table_without_rows_or_with_words_is_refused(run: Path, name: str) -> None:
     (TWO_BETAS if "validation" in name else TRAINING)[:0].to_csv(run / name, index=False)
     with pytest.raises(UserInputError, match=f"{name} holds no episode: wait for one"):
-        check(compose("plot_training", [f"run={run}"]))
+        main.check(compose("plot_training", [f"run={run}"]))
     text = (TWO_BETAS if "validation" in name else TRAINING).to_csv(index=False)
     (run / name).write_text(text.replace("\n0.5", "\nx"))
     assert (run / name).read_text() != text
     with pytest.raises(UserInputError, match=f"{name} cannot be read .*could not convert"):
-        check(compose("plot_training", [f"run={run}"]))
+        main.check(compose("plot_training", [f"run={run}"]))
 
 
 @pytest.mark.parametrize(
@@ -161,6 +177,6 @@ def test_a_table_without_rows_or_with_words_is_refused(run: Path, name: str) -> 
 def test_a_picture_that_cannot_be_written_is_refused(run: Path, out: str, told: str) -> None:
     (run / "taken.png").mkdir()
     out = out.replace("{run}", str(run))
-    for verb, overrides in ((check, ["plot_training", f"run={run}"]), (draw_maps.check, ["draw_maps"])):
+    for verb, overrides in ((main.check, ["plot_training", f"run={run}"]), (draw_maps.main.check, ["draw_maps"])):
         with pytest.raises(UserInputError, match=told):
             verb(compose(overrides[0], [*overrides[1:], f"out={out}"]))

@@ -130,6 +130,18 @@ def test_the_four_formats_hold_every_cell(tmp_path: Path) -> None:
     assert pd.read_csv(tmp_path / "table.csv").shape == shown.shape
 
 
+def test_intervals_over_two_seeds_are_wide_but_hold_nothing_that_cannot_be(tmp_path: Path) -> None:
+    one = evaluate(tmp_path / "a", "rcdsac_pow", {-1.0: 0})
+    two = evaluate(tmp_path / "b", "rcdsac_pow", {-1.0: 1}, train_seed=1)
+    alone, both = (findings.summary(read_episodes(named)).set_index("statistic") for named in ([one], [one, two]))
+    # All maps have the same collisions, so that the seeds alone make the interval: 0 and 1 more, 1.5 ± 12.7 x 0.5.
+    assert tuple(alone.loc["collisions", ["value", "low", "high"]]) == (1.0, 1.0, 1.0)
+    assert both.loc["collisions", "value"] == 1.5
+    assert both.loc["collisions", "low"] == 0.0
+    assert both.loc["collisions", "high"] > 4.0
+    assert tuple(both.loc["collision_free", ["low", "high"]]) == (0.0, 1.0)
+
+
 # ------------------------------------------------------------------------------------------------ refusals
 @pytest.mark.parametrize(
     ("changed", "sentence"),
@@ -316,3 +328,20 @@ def test_a_run_that_logged_no_time_is_drawn_over_its_updates(tmp_path: Path) -> 
     assert (over_updates, over_minutes) == ([2, 2], [1, 1])
     assert panels[1].lines[0].get_xdata().tolist() == [1, 3]
     assert len(learning_curves({"silent": runs["silent"]}).axes) == 2
+
+
+def test_learning_curves_of_a_run_that_is_training(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    (folder / "csv/scalars/time").mkdir(parents=True)
+    table, clock = folder / "validation_episodes.csv", folder / "csv/scalars/time/elapsed_s.csv"
+    table.write_text("iterat")
+    assert validation_of_runs([folder]) == {}
+    table.write_text("iteration,updates,collisions,reward\n0,200,4,10\n1,400,2,3")  # 30 to be
+    clock.write_text("10000,60\n20000,18")  # 180 to be
+    found = validation_of_runs([folder])["run"]
+    assert found.to_dict("records") == [
+        {"iteration": 0, "updates": 200, "collisions": 4, "reward": 10, "elapsed_s": 60}
+    ]
+    table.write_text("iteration,updates\n0,200,4,10\n1,2,3,4,5\n")
+    with pytest.raises(UserInputError, match=r"run cannot be read \(.*\): leave it out"):
+        validation_of_runs([folder])

@@ -103,12 +103,12 @@ def test_a_process_ends_by_itself_when_the_main_one_is_killed(tmp_path: Path) ->
         "from functools import partial\n"
         "from pathlib import Path\n"
         "from rcdsac_trl.rollout import evaluation_pool as drivers\n"
-        "from test_drivers import endless\n"
-        "drivers._PRELOADED = 'test_drivers'\n"
+        "from test_evaluation_pool import endless\n"
+        "drivers._PRELOADED = 'test_evaluation_pool'\n"
         "drivers.Drivers(partial(endless, Path(sys.argv[1])), 1, processes=1)\n"
         "time.sleep(1000)\n"
     )
-    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     command = [sys.executable, "-c", program, str(tmp_path / "process")]
     main = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path})
     process = wait_for(tmp_path / "process")
@@ -119,11 +119,11 @@ def test_a_process_ends_by_itself_when_the_main_one_is_killed(tmp_path: Path) ->
 
 
 def test_training_leaves_a_core_to_validation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rcdsac_trl.rollout.evaluation_pool.usable_cores", lambda: 4)
+    monkeypatch.setattr("rcdsac_trl.system.processes.usable_cores", lambda: 4)
     assert [resolve_processes_beside("auto", 9, threads) for threads in (1, 2, 4)] == [3, 2, 1]
     assert resolve_processes_beside("auto", 2, threads=1) == 2
     assert [resolve_processes_beside(given, 3, threads=1) for given in (0, 1, 8)] == [0, 1, 3]
-    monkeypatch.setattr("rcdsac_trl.rollout.evaluation_pool.usable_cores", lambda: 1)
+    monkeypatch.setattr("rcdsac_trl.system.processes.usable_cores", lambda: 1)
     assert resolve_processes_beside("auto", 9, threads=1) == 0
 
 

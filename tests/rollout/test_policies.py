@@ -146,8 +146,8 @@ def seen(batch: tuple[int, ...], seed: int, sensor: str = "narrow") -> TensorDic
     """What agents may see, at random; a third of the sensor's bins sees nothing."""
     generator = torch.Generator().manual_seed(seed)
     given = {key: -torch.rand(*batch, size, generator=generator) for key, size in SIZES.items()}
-    heard = torch.rand(given["range"].shape, generator=generator) > 1 / 3
-    given["range"] = (0.5 - 2.4 * given["range"]) * heard * torch.from_numpy(sensor_mask(sensor))
+    seeing = torch.rand(given["range"].shape, generator=generator) > 1 / 3
+    given["range"] = (0.5 - 2.4 * given["range"]) * seeing * torch.from_numpy(sensor_mask(sensor))
     given["is_init"] = torch.rand(*batch, 1, generator=generator) < 0.1
     return TensorDict(given, batch_size=batch)
 

@@ -99,7 +99,7 @@ COLLECTORS = {
     "one process": ("collector.num_processes=0",),
     "two": ("collector.num_processes=2",),
     "single": ("collector=single",),
-    "single of workers": ("collector=single", "world.num_workers=3"),
+    "parallel": ("collector=parallel_env", "world.num_workers=3"),
 }
 AGENTS = 3
 
@@ -127,7 +127,7 @@ def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pyt
     monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
     first = collected(row, *COLLECTORS["one process"])
     assert first[0].batch_size == (AGENTS, STEPS)
-    for name in ("two", "single", "single of workers"):
+    for name in ("two", "single", "parallel"):
         for batch, expected in zip(collected(row, *COLLECTORS[name]), first, strict=True):
             for key in expected.keys(True, True):
                 assert torch.equal(batch[key], expected[key]), (name, key)
@@ -179,7 +179,7 @@ def processes() -> Iterator[Callable[..., TeamProcesses]]:
     def start(*makes: Any) -> TeamProcesses:
         started.append(teams := TeamProcesses(makes, [f"agents {n}" for n in range(len(makes))], None))
         teams.ask(FIRST)
-        teams._timeout_s = TIMEOUT_S
+        teams.pool._timeout_s = TIMEOUT_S
         return teams
 
     yield start
@@ -191,13 +191,13 @@ def processes() -> Iterator[Callable[..., TeamProcesses]]:
 
 def test_slow_processes_that_take_steps_do_not_count_as_hung(processes: Callable[..., TeamProcesses]) -> None:
     teams = processes(*[partial(answering, TIMEOUT_S + 2.0, "steps")] * 2)
-    pids = [process.pid for process in teams._processes]
+    pids = [process.pid for process in teams.pool.processes]
     assert teams.ask(SECOND)["action"][:, 0, 0].tolist() == [pid % 1000 for pid in pids]
 
 
 @pytest.mark.parametrize(
     ("does", "told"),
-    [("ends", "ended with exit code 7"), ("fails", "ended with exit code 1"), ("sleeps", "gave no answer within 5 s")],
+    [("ends", "ended with exit code 7"), ("fails", "ended with exit code 1"), ("sleeps", "made no step within 5 s")],
 )
 def test_a_process_that_fails_is_named(processes: Callable[..., TeamProcesses], does: str, told: str) -> None:
     slow = 1000.0 if does == "sleeps" else 0.0
@@ -207,13 +207,13 @@ def test_a_process_that_fails_is_named(processes: Callable[..., TeamProcesses], 
 
 
 @pytest.mark.parametrize(
-    ("number", "told"), [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "gave no answer within 5 s")]
+    ("number", "told"), [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "made no step within 5 s")]
 )
 def test_a_process_that_cannot_even_be_asked_is_named(
     processes: Callable[..., TeamProcesses], number: signal.Signals, told: str
 ) -> None:
     teams = processes(*[partial(answering, 0.0, "steps")] * 2)
-    os.kill(teams._processes[0].pid, number)
+    os.kill(teams.pool.processes[0].pid, number)
     large = SECOND._replace(weights=bytes(10_000_000))  # more than a pipe holds
     with pytest.raises(WorkerError, match=rf"^worker process 1 of 2 \(agents 0\) {told}$"):
         teams.ask(large)

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,24 +18,23 @@ import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torchrl.envs import ParallelEnv
 
 from rcdsac_trl import train
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.run_config import CHECKPOINTS
 from rcdsac_trl.errors import TrainingError, UserInputError
-from rcdsac_trl.evaluation.make_evaluation import make_evaluation
+from rcdsac_trl.evaluation.evaluation import make_evaluation
+from rcdsac_trl.rollout.policies import CollectionPolicy
 from rcdsac_trl.rollout.worker_processes import Request, TeamProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress, newest
 from rcdsac_trl.system import resources
-from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.training.setup import resume_training
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.task.agent_group import AgentGroup
-from rcdsac_trl.world.task.env import make_env
-from rcdsac_trl.world.task.parallel import Workers
 from tiny import STEPS, TINY, tiny_trainer
 
-WORKERS = ["collector=single", "world.num_workers=2", "schedule.iterations=3", "validation.every_iterations=3"]
+WORKERS = ["collector=parallel_env", "world.num_workers=2", "schedule.iterations=3", "validation.every_iterations=3"]
 SMALL = MapSettings(size_m=10.0, layouts=("clutter",), num_movers=0)
 
 
@@ -44,17 +44,17 @@ def signalled(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Send the second worker of a split a signal before some of its steps, counted over all environments."""
 
     def arrange(split: str, at: list[int], number: signal.Signals = signal.SIGKILL) -> None:
-        step = Workers._step
+        step = ParallelEnv._step
         counted = [0]
 
-        def counting(self: Workers, tensordict: TensorDictBase) -> TensorDictBase:
+        def counting(self: ParallelEnv, tensordict: TensorDictBase) -> TensorDictBase:
             if self.create_env_kwargs[0]["split"] == split:
                 if counted[0] in at:
                     os.kill(self._workers[1].pid, number)
                 counted[0] += 1
             return step(self, tensordict)
 
-        monkeypatch.setattr(Workers, "_step", counting)
+        monkeypatch.setattr(ParallelEnv, "_step", counting)
 
     return arrange
 
@@ -88,13 +88,13 @@ def test_a_run_goes_on_after_a_worker_was_killed(tmp_path: Path, signalled: Call
 
 
 def test_a_run_goes_on_after_a_team_was_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rcdsac_trl.rollout.worker_processes.START_METHOD", "fork")  # starts at once
+    monkeypatch.setattr("rcdsac_trl.system.process_pool.START_METHOD", "fork")  # starts at once
     ask, asked = TeamProcesses.ask, [0]
 
     def killing(self: TeamProcesses, request: Request) -> TensorDictBase:
         asked[0] += 1
         if asked[0] == 2:
-            os.kill(self._processes[1].pid, signal.SIGKILL)
+            os.kill(self.pool.processes[1].pid, signal.SIGKILL)
         return ask(self, request)
 
     monkeypatch.setattr(TeamProcesses, "ask", killing)
@@ -111,7 +111,7 @@ def test_a_run_goes_on_after_a_team_was_killed(tmp_path: Path, monkeypatch: pyte
 def test_a_validation_after_a_fault_is_what_it_would_have_been(
     tmp_path: Path, tiny_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rcdsac_trl.rollout.evaluation_pool.START_METHOD", "fork")  # starts at once
+    monkeypatch.setattr("rcdsac_trl.system.process_pool.START_METHOD", "fork")  # starts at once
     step = AgentGroup.step
     left = iter(tmp_path / f"killed{number}" for number in range(2))
     main = os.getpid()
@@ -145,7 +145,8 @@ def test_a_worker_that_hangs_counts_as_dead_and_too_many_faults_end_the_run(
     # Making a map takes a moment too, and other work may take the core meanwhile.
     trainer = tiny_trainer(run, "rcdsac_pow", *WORKERS, "world.worker_timeout_s=6", "world.max_restarts=1")
     told = (
-        "iteration 1, training map 2: worker process 2 of 2 (split train, seed 0, agents 1) gave no answer within 6 s; "
+        "iteration 1, training map 2: one of 2 worker processes (split train, seed 0, agents 0; split train, seed 0, "
+        "agents 1) gave no answer within 6 s; "
         f"world.max_restarts=1 allows no further restart: training stops; 1 iterations are saved, resume={run} "
         "continues there"
     )
@@ -160,30 +161,17 @@ def test_a_worker_that_hangs_counts_as_dead_and_too_many_faults_end_the_run(
     assert training_rows(run)["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
 
 
-@pytest.mark.parametrize("act", ["step", *(pytest.param(act, marks=pytest.mark.slow) for act in ("reset", "seed"))])
-def test_a_dead_worker_is_named_whatever_it_is_asked(act: str) -> None:
-    env = make_env(SMALL, seed=3, agent_ids=range(4), num_workers=2)
-    tensordict = env.reset()
-    pids = [worker.pid for worker in env._workers]
-    os.kill(pids[0], signal.SIGKILL)
-    env._workers[0].join()
-    told = r"worker process 1 of 2 \(split train, seed 3, agents 0, 1\) was killed by SIGKILL"
-    ask = {"step": lambda: env.rand_step(tensordict), "seed": lambda: env.set_seed(0), "reset": env.reset}[act]
-    with pytest.raises(WorkerError, match=told):
-        ask()
-    env.close()
-    for pid in pids:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, 0)
-
-
-def test_a_worker_that_fails_by_itself_is_named_with_its_exit_code() -> None:
-    env = make_env(SMALL, agent_ids=range(2), num_workers=2)
-    tensordict = env.reset()
-    tensordict["action"] = env.action_spec.rand() + 5.0
-    with pytest.raises(WorkerError, match=r"worker process [12] of 2 .* ended with exit code 1"):
-        env.step(tensordict)
-    env.close()
+def test_a_worker_that_fails_by_itself_is_named_with_its_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        CollectionPolicy, "forward", lambda self, td: td.set("action", torch.full((*td.batch_size, 2), 5.0))
+    )
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", *WORKERS, "world.max_restarts=0")
+    told = r"worker process [12] of 2 \(split train, seed 0, agents [01]\) ended with exit code 1"
+    with pytest.raises(TrainingError, match=told):
+        trainer.run()
+    assert not multiprocessing.active_children()
 
 
 # ------------------------------------------------------------------------------------------------ the disk
@@ -385,22 +373,47 @@ def test_networks_that_do_not_fit_leave_nothing_behind(tmp_path: Path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_available_memory_is_the_least_of_what_the_machine_and_the_group_leave(
+def test_available_memory_is_the_least_of_what_the_machine_and_the_container_leave(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    meminfo = tmp_path / "meminfo"
-    monkeypatch.setattr(resources, "_MEMINFO", meminfo)
-    monkeypatch.setattr(resources, "_CGROUP", tmp_path)
-    assert resources.available_memory_bytes() is None
-    resources.check_memory("it", 10**18, "give up")  # nothing is known, so nothing refused
-    meminfo.write_text("MemTotal: 9000 kB\nMemAvailable:    5000 kB\nSwapFree: 1000 kB\n")
-    assert resources.available_memory_bytes() == 6000 * 1024
-    (tmp_path / "memory.current").write_text("3000000\n")
-    (tmp_path / "memory.stat").write_text("anon 5\ninactive_file 500000\n")
-    (tmp_path / "memory.max").write_text("max\n")
-    assert resources.available_memory_bytes() == 6000 * 1024
-    (tmp_path / "memory.max").write_text("4000000\n")
-    assert resources.available_memory_bytes() == 1_500_000
+    proc, group = tmp_path / "proc", tmp_path / "sys" / "fs" / "cgroup"
+    proc.mkdir()
+    group.mkdir(parents=True)
+    assert resources.available_memory_bytes(tmp_path) is None
+    (proc / "meminfo").write_text("MemTotal: 9000 kB\nMemAvailable:    5000 kB\nSwapFree: 1000 kB\n")
+    assert resources.available_memory_bytes(tmp_path) == 6000 * 1024
+    (group / "memory.current").write_text("3000000\n")
+    (group / "memory.stat").write_text("anon 5\ninactive_file 500000\n")
+    (group / "memory.max").write_text("max\n")
+    assert resources.available_memory_bytes(tmp_path) == 6000 * 1024
+    (group / "memory.max").write_text("4000000\n")
+    assert resources.available_memory_bytes(tmp_path) == 1_500_000
+    for known, refused in ((None, 10**18), (10**6, 999_999)):
+        monkeypatch.setattr(resources, "available_memory_bytes", lambda known=known: known)
+        resources.check_memory("it", refused, "give up")  # it fits, or nothing is known
+    with pytest.raises(UserInputError, match=r"^it: 1.0 MB of memory needed, 1.0 MB available: give up$"):
+        resources.check_memory("it", 10**6 + 1, "give up")
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (
+            FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp', '/var/tmp']"),
+            "there is no folder for temporary files: set TMPDIR to one that can be written",
+        ),
+        (
+            OSError("AF_UNIX path too long"),
+            "the folder for temporary files has too long a path (/a/long/one): set TMPDIR to another",
+        ),
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "runs/a"), None),
+    ],
+)
+def test_folders_for_temporary_files_that_do_not_serve_are_named(
+    monkeypatch: pytest.MonkeyPatch, error: OSError, sentence: str | None
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/a/long/one")
+    assert resources.fault_sentence(error) == sentence
 
 
 def torch_allocates_too_much() -> None:

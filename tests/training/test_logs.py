@@ -147,6 +147,7 @@ def test_the_console_log_shows_rates_and_every_condition(tiny_run: Path) -> None
 def test_tables_grow_under_one_header(tmp_path: Path) -> None:
     log = RunLog(tmp_path, [])
     rows = pd.DataFrame({"iteration": [0, 0], "reward": [1 / 3, 2.0]})
+    (tmp_path / "training_episodes.csv").touch()  # all that a full disk left of a table
     log.episodes("training", rows)
     log.episodes("training", rows.assign(iteration=1))
     log.message("hello")

@@ -1,5 +1,7 @@
 """A run has its folder to itself: two never meet in one, and one that is refused leaves no trace."""
 
+import errno
+import fcntl
 import json
 import os
 import subprocess
@@ -12,6 +14,7 @@ import yaml
 
 from rcdsac_trl.config.compose import output_folder
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import newest
 from tiny import AGENTS, ITERATIONS, TINY, tiny_trainer
 
@@ -96,6 +99,15 @@ def test_a_lock_that_cannot_be_opened_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=rf"^{tmp_path}/lock cannot be opened \(Is a directory\): remove it$"):
         tiny_trainer(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["lock"]
+
+
+def test_a_disk_without_locks_is_not_taken_for_another_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    with pytest.raises(UserInputError, match=r"/lock cannot be locked \(No locks available\): choose a folder on"):
+        FolderLock(tmp_path)
 
 
 def test_runs_started_in_the_same_second_get_folders_of_their_own() -> None:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -18,6 +18,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.errors import TrainingError
+from rcdsac_trl.rollout.env_workers import EnvWorkers
 from rcdsac_trl.rollout.episode_collectors import CollectorEpisodes
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.metrics import METRICS
@@ -25,9 +26,10 @@ from rcdsac_trl.storage.checkpoint import load_weights
 from rcdsac_trl.storage.checkpoint_record import Progress, load_progress
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.training.learner import LOSS_KEYS, Learner
+from rcdsac_trl.training.restart_budget import RestartBudget
 from rcdsac_trl.training.run_log import RunLog
-from rcdsac_trl.training.trainer import Trainer
-from rcdsac_trl.training.validation import Snapshot
+from rcdsac_trl.training.trainer import StopTraining, Trainer, saved_sentence
+from rcdsac_trl.training.validation import Snapshot, Validation
 from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.task import episode
 from rcdsac_trl.world.task.env import NavigationEnv, make_env
@@ -98,7 +100,7 @@ class StubLearner(Learner):
         return b"actor after %d iterations" % (self.begun_after + self.calls)
 
 
-class StubValidation:
+class StubEvaluator:
     """Finds episodes of two conditions whose mean reward is the next of some scores."""
 
     def __init__(self, events: list[Any], scores: Sequence[float], beside: bool) -> None:
@@ -114,9 +116,9 @@ class StubValidation:
         self.snapshot = snapshot
         self.events.append(("validate", snapshot.progress.iterations, "alone" if alone else "beside"))
 
-    def look(self) -> None:
+    def poll(self) -> None:
         if self.snapshot is not None:
-            self.events.append("look")
+            self.events.append("poll")
 
     def finish(self) -> pd.DataFrame:
         assert self.snapshot is not None
@@ -195,27 +197,43 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
         "fail_in": None,
         "max_restarts": 3,
         "progress": Progress(),
+        "on_iteration_end": None,
     } | changes
+    layout = Schedule(**schedule | changes.get("schedule", {}))
+    checkpoints, log = StubCheckpoints(events), RunLog(folder, [])
+    restarts = RestartBudget(
+        parts["max_restarts"],
+        parts["progress"].restarts,
+        message=log.message,
+        saved=lambda: saved_sentence(checkpoints, log),  # type: ignore[arg-type]
+    )
     return Trainer(
-        schedule=Schedule(**schedule | changes.get("schedule", {})),
+        schedule=layout,
         progress=parts["progress"],
         episodes=CollectorEpisodes(
             lambda iteration, map_index: Collector(events, iteration, map_index),  # type: ignore[arg-type,return-value]
             lambda iteration: events.append(("iteration", iteration)),
             iteration=parts["progress"].iterations,
             map_index=parts["progress"].iterations + parts["progress"].skipped_maps,
+            workers=EnvWorkers([], None),
         ),
         learner=StubLearner(events, parts["interrupt_in"], parts["progress"].iterations),
         guard=StubGuard(events, parts["fail_in"]),  # type: ignore[arg-type]
-        validate=StubValidation(events, parts["scores"], parts["beside"]),  # type: ignore[arg-type]
-        validate_every=parts["validate_every"],
-        pending=parts["pending"],
-        checkpoints=StubCheckpoints(events),  # type: ignore[arg-type]
+        validation=Validation(
+            StubEvaluator(events, parts["scores"], parts["beside"]),  # type: ignore[arg-type]
+            iterations=layout.iterations,
+            every_iterations=parts["validate_every"],
+            restarts=restarts,
+            log=log,
+            pending=parts["pending"],
+        ),
+        checkpoints=checkpoints,  # type: ignore[arg-type]
         checkpoint_every=parts["checkpoint_every"],
-        log=RunLog(folder, []),
+        restarts=restarts,
+        log=log,
         lock=StubLock(events),  # type: ignore[arg-type]
-        max_restarts=parts["max_restarts"],
         context_key="risk",
+        on_iteration_end=parts["on_iteration_end"],
     )
 
 
@@ -308,10 +326,10 @@ def test_what_runs_beside_is_taken_in_when_the_next_is_due_and_changes_nothing(t
         )
         trainer.run()
         assert (trainer.progress.best_score, trainer.progress.best_iterations) == (-20.0, 4)
-    kept = ("update", "validate", "look", "validated")
+    kept = ("update", "validate", "poll", "validated")
     assert [event for event in ran[True] if event[0] in kept or event in kept] == [
         *(("update", 3, 0.0, 1.0), ("update", 3, 0.5, 1.0), ("validate", 2, "beside")),
-        *(("update", 3, 1.0, 1.0), "look", ("update", 3, 1.0, 0.75), ("validated", 2), ("validate", 4, "beside")),
+        *(("update", 3, 1.0, 1.0), "poll", ("update", 3, 1.0, 0.75), ("validated", 2), ("validate", 4, "beside")),
         *(("update", 3, 1.0, 0.5), ("validated", 4), ("validate", 5, "alone"), ("validated", 5)),
     ]
     # What is found stands where it belongs, whenever it was found.
@@ -339,6 +357,42 @@ def test_a_run_goes_on_with_the_validation_that_was_under_way(tmp_path: Path) ->
     ]
     rows = pd.read_csv(tmp_path / "validation_episodes.csv")
     assert rows[["iteration", "updates"]].drop_duplicates().to_numpy().tolist() == [[1, 6], [3, 12], [4, 15]]
+
+
+def test_a_hook_sees_every_iteration_once_it_is_logged_and_before_it_is_saved(tmp_path: Path) -> None:
+    seen: list[tuple[int, int | None, float]] = []
+
+    def hook(trainer: Trainer, record: Mapping[str, float]) -> None:
+        logged = len(pd.read_csv(tmp_path / "training_episodes.csv")) // 2
+        assert logged == trainer.progress.iterations
+        seen.append((trainer.progress.iterations, trainer.checkpoints.saved_iterations, record["train/reward"]))
+
+    trainer = stub_trainer(tmp_path, [], checkpoint_every=1, on_iteration_end=hook, schedule={"iterations": 3})
+    trainer.run()
+    assert seen == [(1, 0, 0.0), (2, 1, 22.0), (3, 2, 44.0)]
+
+
+def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
+    def stop(trainer: Trainer, record: Mapping[str, float]) -> None:
+        if trainer.progress.iterations == 2:
+            raise StopTraining("good enough")
+
+    events: list[Any] = []
+    stub_trainer(tmp_path, events, validate_every=100, on_iteration_end=stop).run()
+    assert [event[1].iterations for event in kinds(events, "save")] == [0, 2]
+    assert events[-3:] == ["collector closed", "validation closed", "lock open"]
+    sentence = f"stopped after 2 iterations (good enough); 2 iterations are saved, resume={tmp_path} continues there"
+    assert (tmp_path / "train.log").read_text().splitlines()[-1] == sentence
+
+    def fail(trainer: Trainer, record: Mapping[str, float]) -> None:
+        raise ZeroDivisionError
+
+    events.clear()
+    with pytest.raises(ZeroDivisionError):
+        stub_trainer(tmp_path, events, checkpoint_every=1, on_iteration_end=fail).run()
+    sentence = f"on_iteration_end failed in iteration 0 (ZeroDivisionError:); 0 iterations are saved, resume={tmp_path}"
+    assert sentence in (tmp_path / "train.log").read_text()
+    assert events[-3:] == ["collector closed", "validation closed", "lock open"]
 
 
 def test_ctrl_c_drops_the_iteration_and_closes_everything(tmp_path: Path) -> None:
@@ -616,7 +670,7 @@ def test_workers_do_not_change_a_run(
 ) -> None:
     """Workers in this process: the same code with the same shapes, without the time that processes take."""
     monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
-    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "collector=single", f"world.num_workers={workers}")
+    trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "collector=parallel_env", f"world.num_workers={workers}")
     assert isinstance(trainer.episodes, CollectorEpisodes)
     assert trainer.episodes._collector is not None
     assert trainer.episodes._collector.env.batch_size == torch.Size([workers, AGENTS // workers])
@@ -625,7 +679,7 @@ def test_workers_do_not_change_a_run(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [["collector=single", "world.num_workers=2"], ["collector.num_processes=2"]])
+@pytest.mark.parametrize("given", [["collector=parallel_env", "world.num_workers=2"], ["collector.num_processes=2"]])
 def test_worker_processes_do_not_change_a_run(tiny_run: Path, tmp_path: Path, given: list[str]) -> None:
     tiny_trainer(tmp_path / "run", "rcdsac_pow", *given).run()
     assert_equal_runs(tiny_run, tmp_path / "run")
@@ -758,7 +812,7 @@ def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: P
         # What is told stays for the whole episode.
         assert (batch["risk"] == batch["risk"][:, :1]).all()
     trainer.episodes.close()
-    trainer.validate.close()
+    trainer.validation.close()
     trainer.log.close()
     trainer.lock.close()
 

@@ -17,6 +17,7 @@ from rcdsac_trl import draw_maps
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.world.maps.contact_sheet import contact_sheet
 from rcdsac_trl.world.maps.generator import LAYOUTS, SPLITS, Box, Cylinder, Map, MapSettings, Mover, generate_map
 from rcdsac_trl.world.maps.geometry import CELL_M, ROBOT_RADIUS_M, lower_clearance, segment_clearance
 from rcdsac_trl.world.maps.grid_search import keeps_connected, label_components
@@ -321,8 +322,7 @@ def test_mixed_is_the_default_and_static_differs_in_movers_only() -> None:
 
 
 def test_contact_sheet_draws_every_map() -> None:
-    sheet = draw_maps.Sheet(out="x.png", count=5, split="validation", seed=1)
-    figure = draw_maps.contact_sheet(sheet, MapSettings())
+    figure = contact_sheet(MapSettings(), "validation", seed=1, count=5)
     assert len(figure.axes) == 5
     for index, axes in enumerate(figure.axes):
         map_ = generate_map(MapSettings(), "validation", 1, index)
@@ -350,11 +350,11 @@ def test_draw_maps_writes_the_picture_and_nothing_else(
         ("count=0", "count=0 is not a whole number from 1 to 100"),
         ("count=many", "count=many must be a whole number"),
         ("split=training", "must be one of train, validation, evaluation"),
-        ("seed=-1", "seed=-1 is not"),
+        ("seed=-1", "seed=-1 must be at least 0"),
         ("out=maps.jpg", "does not name a PNG file"),
         ("map.num_movers=-3", "num_movers is -3"),
     ],
 )
 def test_draw_maps_refuses_what_it_cannot_draw(override: str, sentence: str) -> None:
     with pytest.raises(UserInputError, match=re.escape(sentence)):
-        draw_maps.check(compose("draw_maps", [override]))
+        draw_maps.main.check(compose("draw_maps", [override]))

@@ -8,39 +8,12 @@ import pytest
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world import render
-from rcdsac_trl.world.maps.generator import Box, Cylinder, Map, MapSettings
-from rcdsac_trl.world.render import Renderer, Scene
-from rcdsac_trl.world.sim.lidar import sector_distances
+from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.task.env import NavigationEnv
+from still_scene import MAP, SIZE_M, scene
 
-SIZE_M = 20.0
 SIZE_PX = 416  # 20 px/m and 8 px of margin
-MAP = Map(
-    layout="clutter",
-    size_m=SIZE_M,
-    boxes=(
-        Box(10.0, 15.0, 4.0, 0.3, 0.0, mapped=True, wall=True),
-        Box(5.0, 5.0, 0.6, 0.6, 0.5, mapped=True),
-        Box(16.0, 5.0, 0.6, 0.6, 0.0, mapped=False),
-    ),
-    cylinders=(Cylinder(17.0, 12.0, 0.5, mapped=False),),
-    movers=(),
-)
-
-
-def scene(**changes: object) -> Scene:
-    pose = (10.0, 8.0, 0.0)
-    standing = Scene(
-        map=MAP,
-        pose=pose,
-        distances_m=sector_distances(*pose, MAP.segments(), MAP.circles()),
-        sensor_mask=sensor_mask("narrow"),
-        waypoints=np.array([[10.0, 4.0], [3.0, 2.0]]),
-        movers=np.array([[2.0, 17.0, 0.5]]),
-        trail=[(10.0 - 0.1 * k, 8.0) for k in range(30, -1, -1)],
-        in_contact=False,
-    )
-    return dataclasses.replace(standing, **changes)
 
 
 def at(frame: np.ndarray, x: float, y: float) -> np.ndarray:

@@ -1,17 +1,7 @@
-"""Networks wired to tensor keys: the actor and the critics that learn, and the policy that acts.
-
-Public names::
-
-    build_actor(action_size, vectors, measure | None, widths) -> TensorDictSequential   [encoder, head]
-        observations [B,T,..], risk -> memory [B,T,128], loc, scale [B,T,A]
-    build_critic(action_size, vectors, kind="quantile"|"scalar", measure | None, widths) -> TensorDictSequential
-        observations, action, (tau, risk) -> memory, quantiles [B,T,N]  |  state_action_value [B,T,1]
-    build_policy(actor, action_spec, generator=None) -> ProbabilisticActor              one step, any batch
-        observations, risk, is_init, recurrent_state -> loc, scale, action, ("next", "recurrent_state")
-    recurrent_state_primer(memory_size) -> TensorDictPrimer
-"""
+"""Networks wired to tensor keys: the actor and the critics that learn, and the policy that acts."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -22,7 +12,14 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from rcdsac_trl.agent.networks import ActorHead, Encoder, QuantileHead, ScalarHead, Widths
+from rcdsac_trl.agent.networks import (
+    ActorHead,
+    HistoryEncoder,
+    NetworkSettings,
+    QuantileHead,
+    ScalarHead,
+    encoder_class,
+)
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
@@ -33,15 +30,21 @@ MEMORY_KEY = "memory"
 STATE_KEY = "recurrent_state"
 
 
-def _encoder(vectors: Mapping[str, int], widths: Widths) -> TensorDictModule:
-    return TensorDictModule(Encoder(vectors, widths), in_keys=["range", *vectors], out_keys=[MEMORY_KEY])
+def _encoder(vectors: Mapping[str, int], network: NetworkSettings) -> TensorDictModule:
+    encoder = encoder_class(network)(vectors, network)
+    return TensorDictModule(encoder, in_keys=["range", *vectors], out_keys=[MEMORY_KEY])
+
+
+def _of_heads(network: NetworkSettings) -> NetworkSettings:
+    """Return what heads are made of: the memory is what they read of it."""
+    return replace(network, memory=encoder_class(network).memory_size_of(network))
 
 
 def build_actor(
     action_size: int = 2,
     vectors: Mapping[str, int] = VECTOR_OBSERVATIONS,
     measure: RiskMeasure | None = None,
-    widths: Widths | None = None,
+    network: NetworkSettings | None = None,
 ) -> TensorDictSequential:
     """Return the actor on sequences: an encoder and a head.
 
@@ -49,7 +52,7 @@ def build_actor(
         action_size: number of action dimensions.
         vectors: name and size of the vector observations; add ``collision_weight: 1`` for RCWR.
         measure: conditions the actor on ``risk``; None for no conditioning.
-        widths: layer widths; None for the paper's.
+        network: sizes of the layers, and the encoder; None for the paper's.
 
     Returns:
         Two modules: observations ``[B, T, ..]`` to ``memory`` ``[B, T, 128]``, and ``memory`` (and ``risk``
@@ -61,13 +64,14 @@ def build_actor(
         >>> actor.in_keys
         ['range', 'waypoint', 'velocity', 'risk']
     """
-    widths = widths or Widths()
+    network = network or NetworkSettings()
+    of_heads = _of_heads(network)
     head = TensorDictModule(
-        ActorHead(action_size, widths, measure),
+        ActorHead(action_size, of_heads, measure),
         in_keys=[MEMORY_KEY] if measure is None else [MEMORY_KEY, "risk"],
         out_keys=["loc", "scale"],
     )
-    return TensorDictSequential(_encoder(vectors, widths), head)
+    return TensorDictSequential(_encoder(vectors, network), head)
 
 
 def build_critic(
@@ -75,7 +79,7 @@ def build_critic(
     vectors: Mapping[str, int] = VECTOR_OBSERVATIONS,
     kind: Literal["quantile", "scalar"] = "quantile",
     measure: RiskMeasure | None = None,
-    widths: Widths | None = None,
+    network: NetworkSettings | None = None,
 ) -> TensorDictSequential:
     """Return one critic on sequences: its own encoder and a quantile or a scalar head.
 
@@ -84,15 +88,16 @@ def build_critic(
         vectors: name and size of the vector observations.
         kind: ``"quantile"`` for the distribution of the return at the fractions ``tau``, ``"scalar"`` for its mean.
         measure: conditions a quantile critic on ``risk``; None for no conditioning.
-        widths: layer widths; None for the paper's.
+        network: sizes of the layers, and the encoder; None for the paper's.
 
     Raises:
         UserInputError: for an unknown kind, or a scalar critic with a measure.
     """
-    widths = widths or Widths()
+    network = network or NetworkSettings()
+    of_heads = _of_heads(network)
     head: nn.Module
     if kind == "quantile":
-        head = QuantileHead(action_size, widths, measure)
+        head = QuantileHead(action_size, of_heads, measure)
         in_keys = [MEMORY_KEY, "action", "tau"] + ([] if measure is None else ["risk"])
         out_keys = ["quantiles"]
     elif kind == "scalar":
@@ -100,23 +105,22 @@ def build_critic(
             raise UserInputError(
                 f"a scalar critic cannot be conditioned on risk (measure {measure.name!r}): choose critic 'quantile'"
             )
-        head = ScalarHead(action_size, widths)
+        head = ScalarHead(action_size, of_heads)
         in_keys, out_keys = [MEMORY_KEY, "action"], ["state_action_value"]
     else:
         raise UserInputError(f"there is no critic {kind!r}: choose 'quantile' or 'scalar'")
-    return TensorDictSequential(_encoder(vectors, widths), TensorDictModule(head, in_keys=in_keys, out_keys=out_keys))
+    return TensorDictSequential(_encoder(vectors, network), TensorDictModule(head, in_keys=in_keys, out_keys=out_keys))
 
 
 class _Step(nn.Module):
     """One-step view of an encoder; shares its parameters."""
 
-    def __init__(self, encoder: Encoder) -> None:
+    def __init__(self, encoder: HistoryEncoder) -> None:
         super().__init__()
         self.encoder = encoder
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        state = self.encoder.step(*inputs)
-        return state, state
+        return self.encoder.step(*inputs)
 
 
 def build_policy(
@@ -150,7 +154,7 @@ def build_policy(
     )
 
 
-def recurrent_state_primer(memory_size: int = Widths.memory) -> TensorDictPrimer:
+def recurrent_state_primer(memory_size: int = NetworkSettings.memory) -> TensorDictPrimer:
     """Return the transform that puts a zero ``recurrent_state`` ``[*, memory_size]`` into every reset."""
     state = Unbounded((memory_size,), device="cpu", dtype=torch.float32)
     return TensorDictPrimer({STATE_KEY: state}, default_value=0.0, expand_specs=True)

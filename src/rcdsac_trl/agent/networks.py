@@ -4,54 +4,36 @@ The action, ``beta`` and :math:`\tau` enter *after* the recurrent layer (paper, 
 encoder pass over the observations of a sequence serves current and next step, data and policy action, every
 ``beta`` and every :math:`\tau`. :mod:`rcdsac_trl.agent.actor` wires the parts to tensor keys.
 
-Public names::
-
-    Widths(conv, range, vector, memory, head, cosines)                              frozen dataclass, all defaults
-    Encoder(vectors: Mapping[str, int], widths)
-        .forward(range [B,T,180], *vectors [B,T,k]) -> memory [B,T,128]             sequence, zero initial state
-        .step(range [*,180], *vectors [*,k], is_init [*,1], state [*,128]) -> state [*,128]   (= memory)
-    ActorHead(action_size, widths, measure | None)
-        .forward(memory [..,128], risk [..,1] | None) -> loc [..,A], scale [..,A]
-    QuantileHead(action_size, widths, measure | None)
-        .forward(memory [B,L,128], action [B,L,A], tau [B,L|1,N], risk [B,L|1,1] | None) -> quantiles [B,L,N]
-    ScalarHead(action_size, widths)
-        .forward(memory [..,128], action [..,A]) -> value [..,1]
-
 Pass ``risk`` and ``tau`` with a time dimension of 1 where they are constant along a sequence: the gate is then computed
 once for it.
+
+These layers define what is computed. On a CPU :mod:`rcdsac_trl.agent.kernels.dispatch` runs a compiled twin in their
+place where it knows the module.
 """
 
+import importlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rcdsac_trl.agent.float32 import made_in_float32
-from rcdsac_trl.agent.kernels.observation_features import observation_features
-from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
-from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
+from rcdsac_trl.system.checks import one_of
 
-#: Number of range bins of an observation.
-RANGE_SIZE = 180
 #: Bounds of the policy's log standard deviation.
 LOG_STD_RANGE = (-20.0, 2.0)
-#: Below this number, one call of a layer costs more than what it computes.
-FEW_OBSERVATIONS = 32
-
-
-def _runs_kernels(x: Tensor) -> bool:
-    """Return whether our kernels know the place: a CPU, and no exporter, which knows layers only."""
-    return x.device.type == "cpu" and not torch.compiler.is_compiling() and not torch.jit.is_tracing()
 
 
 @dataclass(frozen=True)
-class Widths:
-    """Layer widths; the defaults are the paper's as far as it states them.
+class NetworkSettings:
+    """Layers of encoders and heads; the defaults are the paper's as far as it states them.
 
     Args:
         conv: channels of both convolutions.
@@ -60,9 +42,12 @@ class Widths:
         memory: size of the recurrent state.
         head: size of every fully-connected layer after the recurrent one, and of the risk gates.
         cosines: number of cosine features of ``beta`` and of a quantile fraction.
+        padding: how the convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
+        encoder: an encoder of yours as ``package.module.Class``; see
+            :class:`HistoryEncoder`. None for :class:`Encoder`.
 
     Raises:
-        UserInputError: if a width is below 1.
+        UserInputError: if a width is below 1, or there is no such padding or encoder.
     """
 
     conv: int = 32
@@ -71,102 +56,158 @@ class Widths:
     memory: int = 128
     head: int = 128
     cosines: int = 64
+    padding: Padding = "circular"
+    encoder: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse widths below 1."""
-        for field in fields(self):
-            if getattr(self, field.name) < 1:
-                raise UserInputError(
-                    f"network width {field.name} = {getattr(self, field.name)} is below 1: give a positive integer"
-                )
+        """Refuse widths below 1, other paddings, and an encoder that cannot be imported."""
+        for name, width in self.widths.items():
+            if width < 1:
+                raise UserInputError(f"network width {name} = {width} is below 1: give a positive integer")
+        one_of("network.padding", self.padding, Padding)
+        if self.encoder is not None:
+            _imported(self.encoder)
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """The sizes of the layers, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, int)}
 
 
 @made_in_float32
 class RangeFeatures(nn.Module):
-    """Two strided convolutions and a linear layer over the range bins: ``[n, 180] -> [n, features]``.
+    """Two strided convolutions and a linear layer over the ring of bins: ``[n, 180] -> [n, features]``.
 
     The linear layer reads the last convolution position by position (all channels of a position together).
+
+    Args:
+        channels: of both convolutions.
+        features: of the linear layer.
+        padding: how the ring is closed; see :mod:`rcdsac_trl.robot.ring`.
     """
 
-    def __init__(self, channels: int, features: int) -> None:
-        """Build the layers for :data:`RANGE_SIZE` bins."""
+    def __init__(self, channels: int, features: int, padding: Padding = "circular") -> None:
+        """Build the layers for :data:`NUM_BINS` bins."""
         super().__init__()
-        self.conv_1 = nn.Conv1d(1, channels, kernel_size=5, stride=2)  # 88 positions
-        self.conv_2 = nn.Conv1d(channels, channels, kernel_size=3, stride=2)  # 43 positions
-        self.linear = nn.Linear(43 * channels, features)
+        self.padding = padding
+        self.conv_1 = nn.Conv1d(1, channels, KERNELS[0], stride=2)
+        self.conv_2 = nn.Conv1d(channels, channels, KERNELS[1], stride=2)
+        self.linear = nn.Linear(num_positions(padding) * channels, features)
+
+    def padded(self, bins: Tensor) -> Tensor:
+        """Return the bins ``[n, 180]`` with those of the ring's other end on both sides, for both convolutions."""
+        before, behind = RING_ENDS[self.padding]
+        return torch.cat((bins[:, NUM_BINS - before :], bins, bins[:, :behind]), dim=1) if before else bins
 
     def forward(self, bins: Tensor) -> Tensor:
-        """Map ``[n, 180]`` to ``[n, features]``; no gradient flows to the bins."""
-        if not _runs_kernels(bins) or len(bins) < FEW_OBSERVATIONS:
-            return self.layers(bins)
-        return observation_features(bins, [], self.stack, [])
-
-    @property
-    def stack(self) -> tuple[nn.Conv1d, nn.Conv1d, nn.Linear]:
-        """The layers in their order."""
-        return self.conv_1, self.conv_2, self.linear
-
-    def layers(self, bins: Tensor) -> Tensor:
-        """Compute the same with the layers one by one."""
-        positions = F.relu(self.conv_2(F.relu(self.conv_1(bins.unsqueeze(1)))))
+        """Map ``[n, 180]`` to ``[n, features]``."""
+        positions = F.relu(self.conv_2(F.relu(self.conv_1(self.padded(bins).unsqueeze(1)))))
         return F.relu(self.linear(positions.transpose(1, 2).flatten(1)))
 
 
-@made_in_float32
-class Encoder(nn.Module):
-    """Observation history to memory: per-input features, concatenated, into a GRU.
+class HistoryEncoder(nn.Module):
+    """What an encoder has to be; derive yours from it and name it in ``network.encoder``.
+
+    It runs by its own layers wherever an agent does: losses, acting, evaluation, ``torch.export``.
 
     Args:
         vectors: name and size of every vector observation besides ``range``, in the order of the call, such as
-            ``{"waypoint": 6, "velocity": 4}``; each gets its own linear layer.
-        widths: layer widths.
+            ``{"waypoint": 6, "velocity": 4}``.
+        network: sizes of the layers.
 
-    Example:
-        >>> encoder = Encoder({"waypoint": 6, "velocity": 4}, Widths())
-        >>> encoder(torch.zeros(2, 8, 180), torch.zeros(2, 8, 6), torch.zeros(2, 8, 4)).shape
-        torch.Size([2, 8, 128])
+    Attributes:
+        memory_size: how many numbers the heads read.
+        state_size: how many numbers it carries from step to step: ``network.memory``.
     """
 
-    def __init__(self, vectors: Mapping[str, int], widths: Widths) -> None:
-        """Build the layers."""
+    def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
         super().__init__()
-        self.memory_size = widths.memory
-        self.range = RangeFeatures(widths.conv, widths.range)
-        self.vectors = nn.ModuleList(nn.Linear(size, widths.vector) for size in vectors.values())
-        self.gru = nn.GRU(widths.range + widths.vector * len(vectors), widths.memory, batch_first=True)
+        self.memory_size, self.state_size = self.memory_size_of(network), network.memory
+
+    @classmethod
+    def memory_size_of(cls, network: NetworkSettings) -> int:
+        """Return how many numbers the heads read; all of the state unless you say otherwise."""
+        return network.memory
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
-        """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
-        if not _runs_kernels(range_) or range_.shape[:2].numel() < FEW_OBSERVATIONS:
-            return self.gru(self._features(range_, vectors))[0]
-        sequences, steps = range_.shape[:2]
-        # Step after step, as the recurrence reads them.
-        bins, *others = (value.transpose(0, 1).reshape(sequences * steps, -1) for value in (range_, *vectors))
-        features = observation_features(bins, others, self.range.stack, list(self.vectors))
-        return gated_recurrence(features.view(steps, sequences, -1), self.gru).transpose(0, 1)
+        """Run whole sequences ``[B, T, ..]`` from a zero state; returns the memory ``[B, T, memory_size]``."""
+        raise NotImplementedError
 
-    def step(self, range_: Tensor, *rest: Tensor) -> Tensor:
-        """Advance any batch ``[*]`` of agents by one observation.
+    def step(self, range_: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Advance any batch ``[*]`` of agents by one observation, to what :meth:`forward` gives there.
 
         Args:
             range_: range observation ``[*, 180]``.
             rest: the vector observations ``[*, size]``, then ``is_init`` ``[*, 1]`` (bool: this is the first
-                observation of an episode, so the state is zeroed first), then the recurrent state ``[*, memory]``.
+                observation of an episode, so the state is zeroed first), then the state ``[*, state_size]``.
 
         Returns:
-            The next recurrent state ``[*, memory]``, which is also the memory the heads read.
+            The memory that the heads read, ``[*, memory_size]``, and the next state ``[*, state_size]``.
         """
+        raise NotImplementedError
+
+
+@made_in_float32
+class Encoder(HistoryEncoder):
+    """Observation history to memory: per-input features, concatenated, into a GRU. Its state is its memory.
+
+    Args:
+        vectors: as for :class:`HistoryEncoder`; each gets its own linear layer.
+        network: sizes of the layers.
+
+    Example:
+        >>> encoder = Encoder({"waypoint": 6, "velocity": 4}, NetworkSettings())
+        >>> encoder(torch.zeros(2, 8, 180), torch.zeros(2, 8, 6), torch.zeros(2, 8, 4)).shape
+        torch.Size([2, 8, 128])
+    """
+
+    def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
+        """Build the layers."""
+        super().__init__(vectors, network)
+        self.range = RangeFeatures(network.conv, network.range, network.padding)
+        self.vectors = nn.ModuleList(nn.Linear(size, network.vector) for size in vectors.values())
+        self.gru = nn.GRU(network.range + network.vector * len(vectors), network.memory, batch_first=True)
+
+    def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
+        """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
+        return self.gru(self.features(range_, vectors))[0]
+
+    def step(self, range_: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
+        """Advance any batch ``[*]`` of agents by one observation; see :meth:`HistoryEncoder.step`."""
         *vectors, is_init, state = rest
-        features = self._features(range_, tuple(vectors))
+        return self.advance(self.features(range_, tuple(vectors)), is_init, state)
+
+    def advance(self, features: Tensor, is_init: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Do the recurrent part of :meth:`step`, from the features ``[*, n]`` of an observation."""
         lead = features.shape[:-1]
         state = torch.where(is_init, torch.zeros_like(state), state).reshape(1, -1, self.memory_size)
-        return self.gru(features.reshape(-1, 1, features.shape[-1]), state)[1].reshape(*lead, self.memory_size)
+        state = self.gru(features.reshape(-1, 1, features.shape[-1]), state)[1].reshape(*lead, self.memory_size)
+        return state, state
 
-    def _features(self, range_: Tensor, vectors: tuple[Tensor, ...]) -> Tensor:
+    def features(self, range_: Tensor, vectors: Sequence[Tensor]) -> Tensor:
+        """Return the rectified features of observations ``[*, ..]``, those of the bins first, ``[*, n]``."""
         lead = range_.shape[:-1]
-        parts = [self.range(range_.reshape(-1, RANGE_SIZE)).reshape(*lead, -1)]
+        parts = [self.range(range_.reshape(-1, NUM_BINS)).reshape(*lead, -1)]
         parts += [F.relu(layer(value)) for layer, value in zip(self.vectors, vectors, strict=True)]
         return torch.cat(parts, dim=-1)
+
+
+def encoder_class(network: NetworkSettings) -> type[HistoryEncoder]:
+    """Return :class:`Encoder`, or the class that ``network.encoder`` names."""
+    return Encoder if network.encoder is None else _imported(network.encoder)
+
+
+def _imported(path: str) -> type[HistoryEncoder]:
+    module, _, name = path.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UserInputError(
+            f"network.encoder={path} cannot be imported ({error}): name a class as package.module.Class"
+        ) from error
+    if not isinstance(found, type) or not issubclass(found, HistoryEncoder):
+        raise UserInputError(f"network.encoder={path} is no HistoryEncoder: derive it from rcdsac_trl.agent.networks'")
+    return found
 
 
 @made_in_float32
@@ -194,20 +235,20 @@ class ActorHead(nn.Module):
 
     Args:
         action_size: number of action dimensions.
-        widths: layer widths.
+        network: sizes of the layers.
         measure: embeds ``beta``; None for no risk gate.
     """
 
-    def __init__(self, action_size: int, widths: Widths, measure: RiskMeasure | None = None) -> None:
+    def __init__(self, action_size: int, network: NetworkSettings, measure: RiskMeasure | None = None) -> None:
         """Build the layers."""
         super().__init__()
         self.measure = measure
-        self.input = nn.Linear(widths.memory, widths.head)
+        self.input = nn.Linear(network.memory, network.head)
         if measure is not None:
-            self.cosines = CosineFeatures(widths.cosines)
-            self.gate = nn.Linear(widths.cosines, widths.head)
-        self.hidden = nn.Linear(widths.head, widths.head)
-        self.output = nn.Linear(widths.head, 2 * action_size)
+            self.cosines = CosineFeatures(network.cosines)
+            self.gate = nn.Linear(network.cosines, network.head)
+        self.hidden = nn.Linear(network.head, network.head)
+        self.output = nn.Linear(network.head, 2 * action_size)
 
     def forward(self, memory: Tensor, risk: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return ``loc`` and ``scale`` ``[.., action]`` of the normal distribution before tanh."""
@@ -230,25 +271,25 @@ class QuantileHead(nn.Module):
 
     Args:
         action_size: number of action dimensions.
-        widths: layer widths.
+        network: sizes of the layers.
         measure: embeds ``beta``; None for a gate of ``tau`` alone.
     """
 
-    def __init__(self, action_size: int, widths: Widths, measure: RiskMeasure | None = None) -> None:
+    def __init__(self, action_size: int, network: NetworkSettings, measure: RiskMeasure | None = None) -> None:
         """Build the layers."""
         super().__init__()
         self.measure = measure
-        self.input = nn.Linear(widths.memory + action_size, widths.head)
-        self.cosines = CosineFeatures(widths.cosines)
-        self.gate_tau = nn.Linear(widths.cosines, widths.head)
+        self.input = nn.Linear(network.memory + action_size, network.head)
+        self.cosines = CosineFeatures(network.cosines)
+        self.gate_tau = nn.Linear(network.cosines, network.head)
         if measure is not None:
-            self.gate_beta = nn.Linear(widths.cosines, widths.head, bias=False)
+            self.gate_beta = nn.Linear(network.cosines, network.head, bias=False)
             # One linear layer over both halves draws from its whole fan-in: so do its halves.
-            bound = 1.0 / math.sqrt(2 * widths.cosines)
+            bound = 1.0 / math.sqrt(2 * network.cosines)
             for parameter in (self.gate_tau.weight, self.gate_tau.bias, self.gate_beta.weight):
                 nn.init.uniform_(parameter, -bound, bound)
-        self.hidden = nn.Linear(widths.head, widths.head)
-        self.output = nn.Linear(widths.head, 1)
+        self.hidden = nn.Linear(network.head, network.head)
+        self.output = nn.Linear(network.head, 1)
 
     def forward(self, memory: Tensor, action: Tensor, tau: Tensor, risk: Tensor | None = None) -> Tensor:
         """Return the quantiles ``[B, L, N]``.
@@ -259,23 +300,18 @@ class QuantileHead(nn.Module):
             tau: fractions in [0, 1], ``[B, L, N]`` or, the same along a sequence, ``[B, 1, N]``.
             risk: ``beta``, ``[B, L, 1]`` or ``[B, 1, 1]``; not read without a measure.
         """
-        beta = None
-        if self.measure is not None:
-            if risk is None:
-                raise ValueError("this critic is conditioned on risk: pass it")
-            beta = self.cosines(self.measure.embed(risk).squeeze(-1))
-        if not _runs_kernels(memory):
-            return self.layers(memory, action, tau, beta)
-        return quantile_values(memory, action, tau, beta, self.cosines.frequencies, self.stack)
+        return self.layers(memory, action, tau, self.beta_cosines(risk))
 
-    @property
-    def stack(self) -> HeadLayers:
-        """The linear layers."""
-        gate_beta = None if self.measure is None else self.gate_beta
-        return HeadLayers(self.input, self.gate_tau, gate_beta, self.hidden, self.output)
+    def beta_cosines(self, risk: Tensor | None) -> Tensor | None:
+        """Return the cosines of ``beta``, ``[B, L|1, cosines]``; None without a measure."""
+        if self.measure is None:
+            return None
+        if risk is None:
+            raise ValueError("this critic is conditioned on risk: pass it")
+        return self.cosines(self.measure.embed(risk).squeeze(-1))
 
     def layers(self, memory: Tensor, action: Tensor, tau: Tensor, beta: Tensor | None) -> Tensor:
-        """Compute the same from beta's cosines, layer by layer."""
+        """Do what follows beta's cosines."""
         x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
         gate = self.gate_tau(self.cosines(tau))
         if beta is not None:
@@ -289,15 +325,15 @@ class ScalarHead(nn.Module):
 
     Args:
         action_size: number of action dimensions.
-        widths: layer widths.
+        network: sizes of the layers.
     """
 
-    def __init__(self, action_size: int, widths: Widths) -> None:
+    def __init__(self, action_size: int, network: NetworkSettings) -> None:
         """Build the layers."""
         super().__init__()
-        self.input = nn.Linear(widths.memory + action_size, widths.head)
-        self.hidden = nn.Linear(widths.head, widths.head)
-        self.output = nn.Linear(widths.head, 1)
+        self.input = nn.Linear(network.memory + action_size, network.head)
+        self.hidden = nn.Linear(network.head, network.head)
+        self.output = nn.Linear(network.head, 1)
 
     def forward(self, memory: Tensor, action: Tensor) -> Tensor:
         """Return the value ``[.., 1]``."""

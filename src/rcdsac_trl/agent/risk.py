@@ -5,15 +5,6 @@ A measure distorts the quantile fractions of a return :math:`Z`: its value is
 drawing :math:`\tau` and evaluating the quantile function at :math:`\psi(\tau;\beta)`.
 
 One sign convention holds for all of them: returns are rewards, and a *smaller* :math:`\beta` is *more averse*.
-
-Public names::
-
-    RiskMeasure                        psi(tau, beta), weight(u, beta), embed(beta), sample(shape, generator),
-                                       from_uniform(u), temper(beta, strength), check(beta)
-                                       .low, .high (sampled range)  .domain  .neutral_beta  .name
-    Neutral, CVaR, PowerLaw, Wang, CPW, VaR
-    MEASURES: dict[str, type[RiskMeasure]]     "neutral", "cvar", "pow", "wang", "cpw", "var"
-    make_measure(name, low=None, high=None) -> RiskMeasure
 """
 
 from abc import ABC, abstractmethod

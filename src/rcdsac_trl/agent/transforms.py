@@ -1,10 +1,4 @@
-"""Where beta comes from: drawn for an episode while collecting, set for a batch while updating.
-
-Public names::
-
-    EpisodeSampler(key, draw, *, seed, agent_ids, first_episode=0, fixed=None)   Transform, outside ParallelEnv
-    Relabel(measure, *, mode, per="transition", beta=None, generator=None)       batch -> batch
-"""
+"""Where beta comes from: drawn for an episode while collecting, set for a batch while updating."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal

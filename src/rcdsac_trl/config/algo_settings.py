@@ -7,7 +7,6 @@ from typing import Literal
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.config.conditions import Condition, check_unique
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.system.checks import one_of
 
 Critic = Literal["quantile", "scalar"]
 Conditioning = Literal["per_episode", "fixed", "none"]
@@ -51,9 +50,6 @@ class AlgoSettings:
 
     def __post_init__(self) -> None:
         """Refuse parts that do not fit together."""
-        one_of("algo.critic", self.critic, Critic)
-        one_of("algo.conditioning", self.conditioning, Conditioning)
-        one_of("algo.relabel", self.relabel, Relabel)
         neutral = self.distortion.name == "neutral"
         if (self.conditioning == "none") != neutral:
             raise UserInputError(
@@ -113,7 +109,7 @@ class AlgoSettings:
 
     @property
     def context_key(self) -> str | None:
-        """What is drawn for an episode and told to the networks."""
+        """Key of the context that is drawn for an episode and read by the networks."""
         if self.conditioning == "per_episode":
             return "risk"
         return "collision_weight" if self.collision_weight is not None else None
@@ -143,8 +139,8 @@ class AlgoSettings:
                 self.distortion.measure.check(beta)
             asked = [Condition(beta=float(beta)) for beta in betas]
         elif betas is not None and [float(beta) for beta in betas] != [self.beta]:
-            told = f"was trained for beta={self.beta:g} alone" if self.beta is not None else "has no beta"
-            raise UserInputError(f"{self.name} {told}: leave beta={list(betas)} out")
+            drives = f"was trained for beta={self.beta:g} alone" if self.beta is not None else "has no beta"
+            raise UserInputError(f"{self.name} {drives}: leave beta={list(betas)} out")
         elif weights is not None:
             for weight in weights:
                 self._check_weight(weight)

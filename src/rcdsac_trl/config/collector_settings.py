@@ -6,36 +6,25 @@ from typing import Literal
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.processes import resolve_processes
 
-
-@dataclass(frozen=True)
-class SlurmSettings:
-    """The SLURM jobs of ``collector=distributed``."""
-
-    partition: str | None
-    timeout_min: int
-
-    def __post_init__(self) -> None:
-        """Refuse what is below 1."""
-        if self.timeout_min < 1:
-            raise UserInputError(f"collector.slurm.timeout_min={self.timeout_min} must be at least 1")
+BY_TORCHRL = ("parallel_env", "single")
+"""The collectors whose environment TorchRL steps, in the process of the learner."""
 
 
 @dataclass(frozen=True)
 class CollectorSettings:
     """What collects the episodes (``conf/collector``)."""
 
-    name: Literal["multi", "single", "ray", "distributed"]
+    name: Literal["multi", "parallel_env", "single", "ray"]
     num_processes: int | Literal["auto"] = 0
     address: str | None = None
-    slurm: SlurmSettings | None = None
 
     def __post_init__(self) -> None:
         """Refuse processes that there cannot be, and what does nothing."""
         resolve_processes(self.num_processes, 1, "collector.num_processes")
-        if self.name == "single" and self.num_processes != 0:
+        if self.name in BY_TORCHRL and self.num_processes != 0:
             raise UserInputError(
-                f"collector.num_processes={self.num_processes} does nothing with collector=single: give "
-                "world.num_workers, or take collector=multi"
+                f"collector.num_processes={self.num_processes} does nothing with collector={self.name}: give "
+                "world.num_workers with collector=parallel_env, or take collector=multi"
             )
         if self.shares_evenly and self.num_processes == 0:
             raise UserInputError(
@@ -45,17 +34,28 @@ class CollectorSettings:
             raise UserInputError(
                 f"collector.address={self.address} does nothing with collector={self.name}: take collector=ray"
             )
-        if self.name != "distributed" and self.slurm is not None:
-            raise UserInputError(f"collector.slurm does nothing with collector={self.name}: take collector=distributed")
-        if self.slurm is not None and self.num_processes == "auto":
-            raise UserInputError(
-                "collector.num_processes=auto counts the cores of this machine, not SLURM's: say how many jobs"
-            )
 
     @property
     def shares_evenly(self) -> bool:
         """Whether TorchRL puts the episodes together, which then must be as many from each process."""
-        return self.name in ("ray", "distributed")
+        return self.name == "ray"
+
+    def check_workers(self, num_workers: int | Literal["auto"]) -> None:
+        """Refuse workers of a ``ParallelEnv`` where there is none, and a ``ParallelEnv`` without workers.
+
+        Raises:
+            UserInputError: with the collector that goes with the number.
+        """
+        if self.name not in BY_TORCHRL and num_workers != 0:
+            raise UserInputError(
+                f"world.num_workers={num_workers} does nothing with collector={self.name}: give "
+                "collector.num_processes, or take collector=parallel_env"
+            )
+        if self.name == "parallel_env" and num_workers == 0:
+            raise UserInputError(
+                "world.num_workers=0 leaves collector=parallel_env without workers: give 1 or more, or auto, or take "
+                "collector=single"
+            )
 
     def check_agents(self, num_agents: int) -> None:
         """Refuse processes that cannot share the agents evenly, where they must.

@@ -53,6 +53,16 @@ def parse(overrides: list[str]) -> list[Override]:
         raise UserInputError(_sentence(error, "", overrides)) from error
 
 
+def key_of(override: str) -> str:
+    """Return the key that an override is about.
+
+    Example:
+        >>> key_of("+experiment=table"), key_of("learner.gamma=0.9")
+        ('experiment', 'learner.gamma')
+    """
+    return override.lstrip("+~").partition("=")[0]
+
+
 def compose(config_name: str, overrides: list[str]) -> DictConfig:
     """Compose a config as the command line does.
 
@@ -69,7 +79,7 @@ def compose(config_name: str, overrides: list[str]) -> DictConfig:
 
 def _compose(config_name: str, overrides: list[str], *, return_hydra_config: bool = False) -> DictConfig:
     for override in overrides:
-        if not override.lstrip("+~").partition("=")[0].partition("@")[0].strip():  # Hydra fails an assertion
+        if not key_of(override).partition("@")[0].strip():  # Hydra fails an assertion
             raise UserInputError(f"{override} names no key: write it as <key>=<value>")
     # Inside a Hydra main the search path is set up already, and setting it up twice is an error.
     inside = GlobalHydra.instance().is_initialized()

@@ -1,4 +1,4 @@
-"""What an agent is told for a whole episode of an evaluation."""
+"""The context of an agent in an episode of an evaluation."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from rcdsac_trl.errors import UserInputError
 
 @dataclass(frozen=True)
 class Condition:
-    """What an agent is told for a whole episode: beta, a collision weight, or nothing; or what turns its beta."""
+    """An agent's context for an episode: beta, a collision weight, or none; or the controller that turns its beta."""
 
     beta: float | None = None
     collision_weight: float | None = None
@@ -25,7 +25,7 @@ class Condition:
 
     @property
     def heading(self) -> str:
-        """Name the condition in pictures; empty where the agent is told nothing."""
+        """Name the condition in pictures; empty where the agent has no context."""
         if self.controller is not None:
             return self.controller.replace("_", " ")
         if self.beta is not None:

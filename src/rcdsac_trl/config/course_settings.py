@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.world.office.depth_cameras import Lens
 
@@ -42,7 +43,6 @@ class OdometrySettings:
 
     def __post_init__(self) -> None:
         """Refuse what would leave the robot lost."""
-        object.__setattr__(self, "velocity_std", tuple(self.velocity_std))
         for name in ("scale_std", "travel_noise", "turn_noise"):
             if not 0.0 <= getattr(self, name) <= 0.2:
                 raise UserInputError(f"odometry.{name}={getattr(self, name):g} must be from 0 to 0.2")
@@ -78,10 +78,8 @@ class CourseSettings:
         """Refuse what is below its limit, and what is there twice."""
         if self.out == "":
             raise UserInputError("out names no folder: give it one, or leave it out")
-        if self.repetitions < 1:
-            raise UserInputError(f"repetitions={self.repetitions} must be at least 1")
-        if self.seed < 0:
-            raise UserInputError(f"seed={self.seed} must be at least 0")
+        check_least("repetitions", self.repetitions, 1)
+        check_least("seed", self.seed, 0)
         if not PERIOD_S <= self.time_limit_s <= 3600.0:
             raise UserInputError(f"time_limit_s={self.time_limit_s:g} must be from {PERIOD_S:g} to 3600 seconds")
         for key, values in (("run", self.runs), ("beta", self.beta or ())):

@@ -25,8 +25,6 @@ class ControllerSettings:
     near_m: float
     far_m: float
     window_steps: int
-    step_size: float
-    exploration: float
 
     def __post_init__(self) -> None:
         """Refuse what the controllers would."""
@@ -36,10 +34,6 @@ class ControllerSettings:
             )
         if self.window_steps < 2:
             raise UserInputError(f"controller.window_steps={self.window_steps} must be at least 2")
-        if self.step_size <= 0:
-            raise UserInputError(f"controller.step_size={self.step_size:g} must be above 0")
-        if not 0.0 <= self.exploration <= 1.0:
-            raise UserInputError(f"controller.exploration={self.exploration:g} must be from 0 to 1")
 
 
 @dataclass(frozen=True)
@@ -84,10 +78,10 @@ class EvaluationSettings:
     run: str | None
     beta: tuple[float, ...] | None
     collision_weight: tuple[float, ...] | None
-    beta_controller: tuple[Literal["clearance", "tail_variance", "bandit"], ...] | None
+    beta_controller: tuple[Literal["clearance", "tail_variance"], ...] | None
     controller: ControllerSettings
     checkpoint: Name
-    baseline: Literal["pursuit"] | None
+    baseline: str | None
     split: Literal["evaluation", "validation"]
     seed: int
     num_maps: int
@@ -107,7 +101,7 @@ class EvaluationSettings:
     def __post_init__(self) -> None:
         """Refuse what is below its limit, and neither or both of run and baseline."""
         if (self.run is None) == (self.baseline is None):
-            raise UserInputError("name what to evaluate: either run=<folder> or baseline=pursuit")
+            raise UserInputError("name what to evaluate: either run=<folder> or baseline=<name>, such as mppi")
         if self.out == "":
             raise UserInputError("out names no folder: give it one, or leave it out")
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):

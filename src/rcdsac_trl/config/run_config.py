@@ -10,16 +10,9 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.compose import choices
-from rcdsac_trl.config.course_settings import CourseSettings
-from rcdsac_trl.config.evaluation_settings import (
-    CalibrationSettings,
-    EvaluationSettings,
-    ExportSettings,
-    PublishSettings,
-)
 from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
@@ -33,13 +26,22 @@ CHECKPOINTS = "checkpoints"
 Settings = TypeVar("Settings")
 
 
+def read_config(cfg: DictConfig, settings: type[Settings]) -> Settings:
+    """Read a composed config as the settings class of its root, such as ``EvaluationSettings`` for ``evaluate.yaml``.
+
+    Raises:
+        UserInputError: for whatever it holds that cannot work.
+    """
+    return read(settings, plain(cfg))
+
+
 def training_settings(cfg: DictConfig) -> TrainingSettings:
     """Read the config of a training.
 
     Raises:
         UserInputError: for whatever it holds that cannot work; without an algorithm, a sentence lists the choices.
     """
-    return _training_settings(_plain(cfg))
+    return _training_settings(plain(cfg))
 
 
 def _training_settings(values: dict[str, Any]) -> TrainingSettings:
@@ -48,58 +50,13 @@ def _training_settings(values: dict[str, Any]) -> TrainingSettings:
     return read(TrainingSettings, values)
 
 
-def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
-    """Read the config of an evaluation.
-
-    Raises:
-        UserInputError: for whatever it holds that cannot work.
-    """
-    return read(EvaluationSettings, _plain(cfg))
-
-
-def calibration_settings(cfg: DictConfig) -> CalibrationSettings:
-    """Read the config of a calibration.
-
-    Raises:
-        UserInputError: for whatever it holds that cannot work.
-    """
-    return read(CalibrationSettings, _plain(cfg))
-
-
-def course_settings(cfg: DictConfig) -> CourseSettings:
-    """Read the config of a drive over the course.
-
-    Raises:
-        UserInputError: for whatever it holds that cannot work.
-    """
-    return read(CourseSettings, _plain(cfg))
-
-
-def export_settings(cfg: DictConfig) -> ExportSettings:
-    """Read the config of an export.
-
-    Raises:
-        UserInputError: for whatever it holds that cannot work.
-    """
-    return read(ExportSettings, _plain(cfg))
-
-
-def publish_settings(cfg: DictConfig) -> PublishSettings:
-    """Read the config of a publication.
-
-    Raises:
-        UserInputError: for whatever it holds that cannot work.
-    """
-    return read(PublishSettings, _plain(cfg))
-
-
 @dataclass(frozen=True)
 class AgentOfRun:
     """The sections of a run's config that say what its agent is, and nothing of how it was trained."""
 
     algo: AlgoSettings
     sensor: SensorSettings
-    network: Widths
+    network: NetworkSettings
     task: TaskSettings
 
 
@@ -134,11 +91,19 @@ def _of_run(folder: Path, key: str, reader: Callable[[dict[str, Any]], Settings]
         cfg = OmegaConf.load(path)
         if not isinstance(cfg, DictConfig):
             raise UserInputError("it holds no keys")
-        return reader(_plain(cfg))
+        return reader(_completed(plain(cfg)))
     except (OSError, ValueError, TypeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())
         raise UserInputError(f"{path} cannot be read ({reason}): name a folder that this version wrote") from error
 
 
-def _plain(cfg: DictConfig) -> dict[str, Any]:
+def _completed(values: dict[str, Any]) -> dict[str, Any]:
+    """Add what runs of earlier versions do not say: their networks padded no ring."""
+    if isinstance(network := values.get("network"), dict):
+        values["network"] = {"padding": "none"} | network
+    return values
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """Return a config as dictionaries, lists and plain values, its interpolations resolved."""
     return OmegaConf.to_container(cfg, resolve=True)  # type: ignore[return-value]

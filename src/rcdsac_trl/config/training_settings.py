@@ -1,13 +1,9 @@
-"""All that a training, an evaluation or a calibration may choose, checked as a whole.
-
-The outermost classes are the roots of ``train.yaml``, ``evaluate.yaml``, ``calibrate.yaml``, ``export.yaml`` and
-``search.yaml`` in ``conf/``; :class:`ExperimentSettings` is what a sweep (``sweep.yaml``) makes its runs of.
-"""
+"""All that a training may choose, checked as a whole."""
 
 from dataclasses import dataclass
 from typing import Literal
 
-from rcdsac_trl.agent.networks import Widths
+from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
@@ -101,7 +97,7 @@ class TrainingSettings:
     device: str
     threads: Threads
     world: TeamSettings
-    network: Widths
+    network: NetworkSettings
     learner: LearnerSettings
     replay: ReplaySettings
     schedule: Schedule
@@ -115,11 +111,7 @@ class TrainingSettings:
         check_least("seed", self.seed, 0)
         runtime.resolve_threads(self.threads)
         self.collector.check_agents(self.world.num_agents)
-        if self.collector.name != "single" and self.world.num_workers != 0:
-            raise UserInputError(
-                f"world.num_workers={self.world.num_workers} does nothing with collector={self.collector.name}: give "
-                "collector.num_processes, or take collector=single"
-            )
+        self.collector.check_workers(self.world.num_workers)
         if self.schedule.distortion_strength(0) < 1:
             self.algo.distortion.measure.temper(0.0, 0.0)  # refuses a measure without a neutral beta
         if not self.algo.default_conditions:

@@ -4,7 +4,6 @@ Nothing here needs PyBullet, Hydra, TorchRL or torch, but for :mod:`rcdsac_trl.d
 """
 
 from rcdsac_trl.deploy.policy.beta_controllers import (
-    BanditBeta,
     BetaController,
     ClearanceBeta,
     FixedBeta,
@@ -22,7 +21,6 @@ from rcdsac_trl.deploy.sensors.sectors import Mount, Sectors
 
 __all__ = [
     "AgentConfig",
-    "BanditBeta",
     "BetaController",
     "CameraPose",
     "ClearanceBeta",

@@ -1,9 +1,9 @@
 """Drive a robot over DDS, without ROS: ``python -m rcdsac_trl.deploy.dds_node <name or folder>``.
 
 For robots whose ROS 2 runs on CycloneDDS. It reads ``scan``, ``odom`` and ``plan``, and writes ``cmd_vel``
-(``geometry_msgs/TwistStamped``) and the return's quantiles on ``return_quantiles``. ``beta`` (``std_msgs/Float64``) and
-``stop`` (``std_msgs/Bool``) are topics, and may be sent while it runs. It needs ``cyclonedds``, an extra:
-``pip install 'rcdsac-trl[dds]'``.
+(as ``geometry_msgs/TwistStamped`` and as ``geometry_msgs/Twist``) and the return's quantiles on ``return_quantiles``.
+``beta`` (``std_msgs/Float64``) and ``stop`` (``std_msgs/Bool``) are topics, and may be sent while it runs. It needs
+``cyclonedds``, an extra: ``pip install 'rcdsac-trl[dds]'``.
 """
 
 import argparse
@@ -13,16 +13,19 @@ import signal
 import sys
 import time
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import rcdsac_trl
 from rcdsac_trl.deploy.policy.driver import Driver
+from rcdsac_trl.deploy.sensors.scan import ZeroMeans
 from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy.ros.dds_bridge import DdsBridge
 
+# Every so many commands, about 2 s, it looks who is at the other end of the topics.
+_REPORT_EVERY = 15
 _LARGEST_DOMAIN = 232  # the ports of larger ones are beyond the last
 
 
@@ -54,7 +57,8 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
     domain_id = _domain_id(os.environ.get("ROS_DOMAIN_ID") or "0")
     remapped = dict(_renaming(text) for text in args.remap)
     x_m, y_m, yaw_rad = args.laser
-    driver = Driver(rcdsac_trl.load(args.agent), mount=Mount(x_m, y_m, yaw_rad, args.laser_upside_down))
+    mount = Mount(x_m, y_m, yaw_rad, args.laser_upside_down)
+    driver = Driver(rcdsac_trl.load(args.agent), mount=mount, zero_means=args.zero_means)
     driver.policy.check_beta(args.beta)
     driver.beta = args.beta
     return DdsBridge(driver, domain_id, remapped=remapped)
@@ -62,6 +66,8 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
 
 def drive(bridge: "DdsBridge") -> None:
     """Step once in every control period, and tell on the standard error stream why the robot does not go as it would.
+
+    Who reads the commands, and which topics nobody writes, is told as well, whenever it changes.
 
     Args:
         bridge: that drives; its clock is that of this computer.
@@ -78,7 +84,12 @@ def drive(bridge: "DdsBridge") -> None:
     period_s = sum(bridge.driver.policy.config.period_s) / 2.0
     due_s = time.monotonic()
     said: str | None = None
+    reported, steps = "", 0
     while not leaving:
+        steps += 1
+        if steps % _REPORT_EVERY == 0 and (report := bridge.report()) != reported:
+            _tell(report)
+            reported = report
         command = bridge.step(time.time())
         if command.reason not in (said, None):
             _tell(str(command.reason))
@@ -105,6 +116,12 @@ def _parser() -> argparse.ArgumentParser:
         help="where the scanner sits, from the robot's centre",
     )
     parser.add_argument("--laser-upside-down", action="store_true", help="the scanner hangs")
+    parser.add_argument(
+        "--zero-means",
+        choices=get_args(ZeroMeans),
+        default="unknown",
+        help="what the scanner's driver means by a reading of 0",
+    )
     parser.add_argument(
         "--remap",
         action="append",

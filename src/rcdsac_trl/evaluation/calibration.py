@@ -1,266 +1,168 @@
-r"""Are the learned quantiles true? Returns of roll-outs from one state and action against what the critics say of them.
-
-The simulation is deterministic, so a state is met again by doing the same again: some agents with the same number,
-hence the same start, goals and movers, drive as one up to a step and its action, and each by its own noise from there
-on. What they earn is a sample of the return whose distribution the critics predicted at that step.
-"""
+"""Calibration: are the quantiles that critics have learnt true? Predictions against the returns of roll-outs."""
 
 import contextlib
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable, Generator, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch
-from tensordict.nn import TensorDictSequential
-from torch import Tensor
-from torchrl.envs import EnvBase
-from tqdm import tqdm
+from omegaconf import DictConfig
 
-from rcdsac_trl.agent.actor import STATE_KEY
-from rcdsac_trl.agent.loss.distributional_sac import OVER_CRITICS, DistributionalSACLoss
-from rcdsac_trl.agent.loss.functional import call_module, squash
-from rcdsac_trl.rollout.evaluation_pool import Rows
-from rcdsac_trl.storage.results_folder import ResultsFolder
-from rcdsac_trl.system.interrupts import interruption_point
-
-DESCRIPTION = "calibration.json"
-"""File that says what a folder's calibration is of."""
-NUM_FRACTIONS = 100
-"""Quantiles that are read of every prediction."""
-
-
-def fractions() -> Tensor:
-    """Return the fractions ``[100]`` at which predictions are read: the middles of 100 equal parts of [0, 1]."""
-    return (torch.arange(NUM_FRACTIONS, dtype=torch.float32) + 0.5) / NUM_FRACTIONS
+from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.config.evaluation_settings import CalibrationSettings
+from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_of_run
+from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation.branches import measure_states
+from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
+from rcdsac_trl.rollout.environments import environment
+from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, drive_maps
+from rcdsac_trl.rollout.make_agent import make_loss, packed_loss, unpacked_loss
+from rcdsac_trl.seeding import stream, torch_stream
+from rcdsac_trl.storage.checkpoint import load_weights
+from rcdsac_trl.storage.checkpoint_record import find
+from rcdsac_trl.system import runtime
+from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.system.provenance import commit
+from rcdsac_trl.world.task.rules import RULES_VERSION
+from rcdsac_trl.world.task.world_settings import WorldSettings
 
 
-@dataclass(frozen=True)
-class Branches:
-    """What came of the groups of roll-outs.
+def make_calibration(cfg: DictConfig) -> MeasuredRun:
+    """Make a calibration of a run; refuses before anything is written.
 
-    Attributes:
-        soft_return: ``[G, M]``, with the entropy bonus of every step but the first, as critics learn it.
-        discounted_reward: ``[G, M]``, without it.
-        history: observations and actions of each group up to the branch, by key ``[G, T, ..]``.
+    It writes ``predictions.csv``, ``returns.csv`` and ``calibration.json``.
+
+    Raises:
+        UserInputError: for a missing run, critics without quantiles, a beta that is missing or outside its domain, a
+            horizon that leaves no room in an episode.
     """
+    settings = read_config(cfg, CalibrationSettings)
+    if settings.run is None:
+        raise UserInputError("name the run whose critics are measured: run=<folder>")
+    folder = Path(settings.run)
+    trained = settings_of_run(folder)
+    if trained.algo.critic != "quantile":
+        raise UserInputError(
+            f"run={folder} has {trained.algo.critic} critics, which predict no quantiles: name a run of another row"
+        )
+    if not 0 < settings.horizon_steps < trained.task.episode_steps:
+        raise UserInputError(
+            f"horizon_steps={settings.horizon_steps} must be below the {trained.task.episode_steps} steps of an "
+            "episode, so that states can be met in it: shorten it"
+        )
+    conditions = trained.algo.conditions(settings.beta, None)
+    checkpoints = folder / CHECKPOINTS
+    find(checkpoints, settings.checkpoint)
 
-    soft_return: Tensor
-    discounted_reward: Tensor
-    history: dict[str, Tensor]
+    def maps() -> Generator[Rows, None, None]:
+        loss = make_loss(trained, "cpu")
+        for damaged in load_weights(checkpoints, settings.checkpoint, loss=loss):
+            print(f"rcdsac_trl: {damaged}", file=sys.stderr)
+        make = partial(_driver, settings, trained, conditions, packed_loss(loss))
+        return drive_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
 
-
-def roll_out(
-    env: EnvBase,
-    actor: TensorDictSequential,
-    *,
-    branch_steps: Sequence[int],
-    num_rollouts: int,
-    num_blocks: int,
-    horizon_steps: int,
-    gamma: float,
-    alpha: float,
-    generator: torch.Generator,
-    episode: int,
-    before_step: Callable[[], None] = interruption_point,
-) -> Branches:
-    r"""Drive groups of agents that part from each other at a step of their own.
-
-    The soft return from step k is :math:`r_k + \sum_{t=1}^{h-1} \gamma^t (r_{k+t} - \alpha \log\pi(a_{k+t}))`: what is
-    beyond the horizon h is missing, a share of about :math:`\gamma^h` of it.
-
-    Args:
-        env: G * M agents, those of a group one after the other and with the same number.
-        actor: encoder and head; its actions are drawn.
-        branch_steps: G numbers k: the group does the same up to action k, and nothing together from then on.
-        num_rollouts: M, agents in a group.
-        num_blocks: equal blocks of the groups, whose agents draw the same noise: one a beta, so that no beta's depends
-            on which others there are.
-        horizon_steps: h.
-        gamma: discount.
-        alpha: temperature.
-        generator: source of the actions' noise.
-        episode: number of the episode and its map.
-        before_step: called before each step.
-    """
-    encoder, head = actor[0], actor[1]
-    parting = torch.tensor(branch_steps).repeat_interleave(num_rollouts)
-    leader = torch.arange(len(parting)) // num_rollouts * num_rollouts
-    keys = [*encoder.in_keys, "action"]
-    history: dict[str, list[Tensor]] = {key: [] for key in keys}
-    soft, plain = torch.zeros(len(parting), dtype=torch.float64), torch.zeros(len(parting), dtype=torch.float64)
-    tensordict = env.reset(episode=episode)
-    for step in range(max(branch_steps) + horizon_steps):
-        before_step()
-        state = encoder.module.step(*[tensordict[key] for key in (*encoder.in_keys, "is_init", STATE_KEY)])
-        loc, scale = head.module(state, *[tensordict[key] for key in head.in_keys[1:]])
-        noise = torch.empty_like(loc[: len(loc) // num_blocks]).normal_(generator=generator).repeat(num_blocks, 1)
-        action, log_prob = squash(loc, scale, noise)
-        # Of equal rows a matrix product need not make equal bits.
-        action = torch.where((step <= parting).unsqueeze(-1), action[leader], action)
-        tensordict = tensordict.set("action", action).set(("next", STATE_KEY), state)
-        if step <= max(branch_steps):
-            for key in keys:
-                history[key].append(tensordict[key][::num_rollouts].clone())
-        tensordict = env.step(tensordict)
-        since = step - parting
-        discount = torch.where((since >= 0) & (since < horizon_steps), gamma ** since.double(), 0.0)
-        reward = tensordict["next", "reward"].squeeze(-1).double()
-        plain += discount * reward
-        soft += discount * (reward - alpha * log_prob.double() * (since > 0))
-        tensordict = env.step_mdp(tensordict)
-    return Branches(
-        soft_return=soft.view(-1, num_rollouts),
-        discounted_reward=plain.view(-1, num_rollouts),
-        history={key: torch.stack(values, 1) for key, values in history.items()},
+    return MeasuredRun(
+        kind="calibration",
+        out=_default_out(settings, folder, conditions) if settings.out is None else Path(settings.out),
+        described=_described(settings, trained, conditions),
+        unit="map",
+        num_units=settings.num_maps,
+        measure=maps,
+        findings=_findings,
     )
 
 
-def predict(
-    loss: DistributionalSACLoss,
-    history: dict[str, Tensor],
-    *,
-    branch_steps: Sequence[int],
-    risk: Tensor | None,
-    memory_steps: int,
-) -> Tensor:
-    """Return the quantiles of each critic at the step of each group, ``[critics, G, 100]``.
-
-    Args:
-        loss: holds the critics.
-        history: of :class:`Branches`.
-        branch_steps: step of each group.
-        risk: beta of each group, ``[G]``; None for critics that read none.
-        memory_steps: observations that the critics look back on, from a zero state; training's sequence length is what
-            they have learnt to read.
-    """
-    predicted = []
-    for critic in loss.critics:
-        rows = []
-        for group, step in enumerate(branch_steps):
-            seen = slice(max(0, step + 1 - memory_steps), step + 1)
-            window = {key: value[group : group + 1, seen] for key, value in history.items()}
-            (memory,) = call_module(critic[0], {key: window[key] for key in critic[0].in_keys})
-            entries = {
-                critic[0].out_keys[0]: memory[:, -1:],
-                "action": window["action"][:, -1:],
-                "tau": fractions().view(1, 1, -1),
-                "risk": None if risk is None else risk[group].view(1, 1, 1),
-            }
-            rows.append(call_module(critic[1], entries)[0].flatten())
-        predicted.append(torch.stack(rows))
-    return torch.stack(predicted)
+def _default_out(settings: CalibrationSettings, run: Path, conditions: Sequence[Condition]) -> Path:
+    name = f"{settings.checkpoint}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
+    return run / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
 
 
-def measure_map(
-    env: EnvBase,
-    loss: DistributionalSACLoss,
-    *,
-    betas: Sequence[float | None],
-    told: bool,
-    branch_steps: Sequence[int],
-    num_rollouts: int,
-    horizon_steps: int,
-    memory_steps: int,
-    gamma: float,
-    generator: torch.Generator,
-    map_index: int,
-    before_step: Callable[[], None] = interruption_point,
-) -> Rows:
-    """Predict and roll out some states of one map, under each beta.
+def _described(
+    settings: CalibrationSettings, trained: TrainingSettings, conditions: Sequence[Condition]
+) -> dict[str, Any]:
+    """Say what is measured and how."""
+    return {
+        "agent": trained.algo.name,
+        "measure": trained.algo.distortion.name,
+        "sensor": trained.sensor.name,
+        "train_seed": trained.seed,
+        "checkpoint": settings.checkpoint,
+        "split": settings.split,
+        "seed": settings.seed,
+        "num_maps": settings.num_maps,
+        "num_states": settings.num_states,
+        "num_rollouts": settings.num_rollouts,
+        "horizon_steps": settings.horizon_steps,
+        "memory_steps": trained.learner.sequence_length,
+        "gamma": trained.learner.gamma,
+        "target_over_critics": trained.learner.target_over_critics,
+        "conditions": [str(condition) for condition in conditions],
+        "rules_version": RULES_VERSION,
+        "commit": commit(),
+    }
 
-    Args:
-        env: agents beta after beta, state after state, roll-out after roll-out.
-        loss: the networks and the temperature.
-        betas: one a block of states; None where there is none.
-        told: whether the networks read beta.
-        branch_steps: step of each state of a block; the same for all betas.
-        num_rollouts: agents a state.
-        horizon_steps: see :func:`roll_out`.
-        memory_steps: see :func:`predict`.
-        gamma: discount.
-        generator: source of the actions' noise.
-        map_index: the map's number.
-        before_step: called before each step.
 
-    Returns:
-        One row a state: `beta`, `map`, `state`, `step`; `quantiles`, a list of 100, of the critics taken together as
-        the targets of training take them; `critic_means`, one a critic; `whole_history_mean`, the mean prediction of
-        critics that look back to the episode's start; and the lists `soft_returns` and `discounted_rewards`.
-    """
-    steps = list(branch_steps) * len(betas)
-    risk = torch.tensor([beta for beta in betas for _ in branch_steps], dtype=torch.float32) if told else None
-    with torch.no_grad():
-        branches = roll_out(
+@contextlib.contextmanager
+def _driver(
+    settings: CalibrationSettings, trained: TrainingSettings, conditions: Sequence[Condition], weights: bytes
+) -> Iterator[Drive]:
+    """Make what predicts and rolls out on one map after another, in this process."""
+    runtime.set_threads(1 if settings.threads == "auto" else settings.threads)
+    loss = unpacked_loss(trained, weights)
+    group = settings.num_states * settings.num_rollouts
+    world = WorldSettings(
+        map_settings=trained.map,
+        task=trained.task,
+        sensor=trained.sensor.name,
+        num_agents=group * len(conditions),
+        num_workers=0,  # a process drives whole maps
+    )
+    states = [state for state in range(settings.num_states) for _ in range(settings.num_rollouts)]
+    env = environment(
+        world,
+        trained.algo,
+        split=settings.split,
+        seed=settings.seed,
+        agent_ids=states * len(conditions),
+        memory=trained.network.memory,
+        conditions=[condition for condition in conditions for _ in range(group)],
+    )
+    latest = trained.task.episode_steps - settings.horizon_steps
+
+    def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
+        steps = stream(settings.seed, "calibration steps", map_index).integers(latest, size=settings.num_states)
+        return measure_states(
             env,
-            loss.actor_network,
-            branch_steps=steps,
-            num_rollouts=num_rollouts,
-            num_blocks=len(betas),
-            horizon_steps=horizon_steps,
-            gamma=gamma,
-            alpha=loss.alpha.item(),
-            generator=generator,
-            episode=map_index,
+            loss,
+            betas=[condition.beta for condition in conditions],
+            conditioned=trained.algo.network_measure is not None,
+            branch_steps=steps.tolist(),
+            num_rollouts=settings.num_rollouts,
+            horizon_steps=settings.horizon_steps,
+            memory_steps=trained.learner.sequence_length,
+            gamma=trained.learner.gamma,
+            generator=torch_stream(settings.seed, "calibration actions", map_index),
+            map_index=map_index,
             before_step=before_step,
         )
-        critics = predict(loss, branches.history, branch_steps=steps, risk=risk, memory_steps=memory_steps)
-        whole = predict(loss, branches.history, branch_steps=steps, risk=risk, memory_steps=max(steps) + 1)
-        over = OVER_CRITICS[loss.target_over_critics]
-        taken, taken_whole = over(list(critics)), over(list(whole))
-    return [
+
+    try:
+        yield drive
+    finally:
+        env.close()
+
+
+def _findings(rows: Rows) -> Findings:
+    rows = sorted(rows, key=lambda row: (row["beta"] or 0.0, row["map"], row["state"]))
+    return Findings(
         {
-            "beta": betas[group // len(branch_steps)],
-            "map": map_index,
-            "state": group % len(branch_steps),
-            "step": step,
-            "quantiles": taken[group].tolist(),
-            "critic_means": critics[:, group].mean(-1).tolist(),
-            "whole_history_mean": taken_whole[group].mean().item(),
-            "soft_returns": branches.soft_return[group].tolist(),
-            "discounted_rewards": branches.discounted_reward[group].tolist(),
+            "predictions.csv": _predictions(rows).to_csv(index=False, float_format="%.6g"),
+            "returns.csv": _returns(rows).to_csv(index=False, float_format="%.6g"),
         }
-        for group, step in enumerate(steps)
-    ]
-
-
-class CalibrationRun:
-    """A calibration and the folder it writes: ``predictions.csv``, ``returns.csv`` and ``calibration.json``.
-
-    Args:
-        out: the folder; made when the results are there.
-        described: what is measured and how.
-        num_maps: maps to drive on.
-        maps: yields the rows of each map as it has been driven.
-
-    Raises:
-        UserInputError: if the folder holds another calibration.
-    """
-
-    def __init__(
-        self,
-        *,
-        out: Path,
-        described: Mapping[str, Any],
-        num_maps: int,
-        maps: Callable[[], Generator[Rows, None, None]],
-    ) -> None:
-        self.results = ResultsFolder(out, DESCRIPTION, described)
-        self.num_maps = num_maps
-        self.maps = maps
-
-    def run(self) -> None:
-        """Drive and write."""
-        with contextlib.closing(self.maps()) as maps:
-            rows = [row for rows in tqdm(maps, total=self.num_maps, unit="map", disable=None) for row in rows]
-        rows.sort(key=lambda row: (row["beta"] or 0.0, row["map"], row["state"]))
-        self.results.write(
-            {
-                "predictions.csv": _predictions(rows).to_csv(index=False, float_format="%.6g"),
-                "returns.csv": _returns(rows).to_csv(index=False, float_format="%.6g"),
-            }
-        )
+    )
 
 
 _STATE = ("beta", "map", "state", "step")

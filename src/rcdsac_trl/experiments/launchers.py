@@ -1,8 +1,7 @@
 """Where the runs of a sweep run: one class for each file of ``conf/launcher``, whose keys are its fields.
 
 Each hands jobs to an engine that exists; what a job is, :func:`~rcdsac_trl.experiments.sweep.execute` alone knows.
-Every
-job is a process of its own that is told its share of the cores.
+Every job is a process of its own that is given its share of the cores.
 """
 
 import importlib
@@ -15,20 +14,22 @@ from typing import Any, Literal
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import FaultError, UserInputError, first_line
 from rcdsac_trl.experiments.sweep import Job, Launcher, State, execute
+from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.extras import needs
 
 Ended = Iterator[tuple[Job, State]]
+Extra = str | int | float | bool | tuple[str, ...] | Mapping[str, str | int | float | bool]
+"""What a parameter of submitit may be."""
 
 
 def _engine(package: str) -> ModuleType:
     return importlib.import_module(package)
 
 
-def _check_least(settings: object, lowest: int, *keys: str) -> None:
+def _check(settings: object, lowest: int, *keys: str) -> None:
     for key in keys:
-        if (value := getattr(settings, key)) < lowest:
-            raise UserInputError(f"launcher.{key}={value} must be at least {lowest}")
+        check_least(f"launcher.{key}", getattr(settings, key), lowest)
 
 
 def _fault(error: BaseException) -> State:
@@ -58,9 +59,9 @@ class JoblibLauncher:
 
     def __post_init__(self) -> None:
         """Refuse what is below 1, and a missing package."""
-        _check_least(self, 1, "cores_per_run")
+        _check(self, 1, "cores_per_run")
         if self.runs_at_once != "auto":
-            _check_least(self, 1, "runs_at_once")
+            _check(self, 1, "runs_at_once")
         needs("joblib", f"launcher={self.name}", extra=self.name, instead="launcher=local")
 
     def run(self, jobs: Sequence[Job]) -> Ended:
@@ -83,24 +84,37 @@ class SlurmLauncher:
     name: Literal["slurm"]
     cluster: Literal["slurm", "local"]
     partition: str | None
-    account: str | None
     timeout_min: int
     requeues: int
     cores_per_run: int
     gpus_per_run: int
-    mem_gb: int
     runs_at_once: int
-    setup: tuple[str, ...]
-    sbatch: tuple[str, ...]
+    extra: Mapping[str, Extra]
 
     def __post_init__(self) -> None:
-        """Refuse what is below its limit, what is no option of sbatch, and a missing package."""
-        _check_least(self, 1, "timeout_min", "cores_per_run", "mem_gb", "runs_at_once")
-        _check_least(self, 0, "requeues", "gpus_per_run")
-        for option in self.sbatch:
-            if not option.partition("=")[2]:
-                raise UserInputError(f"launcher.sbatch={option} is no option of sbatch: write it as <name>=<value>")
+        """Refuse what is below its limit, a missing package, and what it does not understand."""
+        _check(self, 1, "timeout_min", "cores_per_run", "runs_at_once")
+        _check(self, 0, "requeues", "gpus_per_run")
         needs("submitit", f"launcher={self.name}", extra=self.name, instead="launcher=local")
+        try:  # its executor for debugging knows the names of all others
+            _engine("submitit").AutoExecutor(folder=".", cluster="debug").update_parameters(**self._parameters)
+        except (NameError, AssertionError) as error:
+            raise UserInputError(f"launcher.extra is not what submitit takes: {first_line(error)}") from error
+
+    @property
+    def _parameters(self) -> dict[str, Any]:
+        """What submitit is asked for; `extra` wins."""
+        asked = {
+            "name": "rcdsac_trl",
+            "timeout_min": self.timeout_min,
+            "nodes": 1,
+            "tasks_per_node": 1,
+            "cpus_per_task": self.cores_per_run,
+            "gpus_per_node": self.gpus_per_run,
+            "slurm_array_parallelism": self.runs_at_once,
+            "slurm_partition": self.partition,  # None counts as not given
+        }
+        return asked | {key: list(value) if isinstance(value, tuple) else value for key, value in self.extra.items()}
 
     def run(self, jobs: Sequence[Job]) -> Ended:
         """Run every job, see :class:`~rcdsac_trl.experiments.sweep.Launcher`."""
@@ -108,20 +122,7 @@ class SlurmLauncher:
         logs = jobs[0].folder.parent / ".submitit" / "%j"
         try:
             executor = submitit.AutoExecutor(folder=logs, cluster=self.cluster, slurm_max_num_timeout=self.requeues)
-            given = {"slurm_partition": self.partition, "slurm_account": self.account}
-            executor.update_parameters(
-                name="rcdsac_trl",
-                timeout_min=self.timeout_min,
-                nodes=1,
-                tasks_per_node=1,
-                cpus_per_task=self.cores_per_run,
-                gpus_per_node=self.gpus_per_run,
-                mem_gb=self.mem_gb,
-                slurm_array_parallelism=self.runs_at_once,
-                slurm_setup=list(self.setup),
-                slurm_additional_parameters=dict(option.split("=", 1) for option in self.sbatch),
-                **{key: value for key, value in given.items() if value is not None},
-            )
+            executor.update_parameters(**self._parameters)
             submitted = executor.map_array(Requeued(self.cores_per_run), list(jobs))
         except Exception as error:  # whatever submitit and SLURM find to say
             raise FaultError(f"launcher=slurm: {first_line(error)}") from error
@@ -162,8 +163,8 @@ class RayLauncher:
 
     def __post_init__(self) -> None:
         """Refuse what is below its limit, and a missing package."""
-        _check_least(self, 1, "cores_per_run")
-        _check_least(self, 0, "gpus_per_run")
+        _check(self, 1, "cores_per_run")
+        _check(self, 0, "gpus_per_run")
         needs("ray", f"launcher={self.name}", extra=self.name, instead="launcher=local")
 
     def run(self, jobs: Sequence[Job]) -> Ended:

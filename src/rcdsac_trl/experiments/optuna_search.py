@@ -4,87 +4,63 @@ Hydra's own Optuna sweeper wants an Optuna that is years old, and knows nothing 
 Optuna is asked and told; a trial is a job as a sweep has them, and its validation table is read while it trains, so
 that it can be pruned. Everything Optuna knows is in its storage: a search that was killed goes on with the trials that
 were lost, from their checkpoints, and several processes may search together.
-
-Public names::
-
-    Number, Choice      what is searched
-    Search              the search
 """
 
 import importlib.util
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pandas as pd
-
+from rcdsac_trl.config.compose import compose, key_of, parse
 from rcdsac_trl.config.experiment_settings import SearchSettings
+from rcdsac_trl.config.run_config import plain
+from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.experiments.search_space import Searched, searched_in
 from rcdsac_trl.experiments.sweep import Job, State, execute
 from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.storage.atomic import FolderLock
+from rcdsac_trl.tables import read_growing
+from rcdsac_trl.training.setup import check_training
 
 if TYPE_CHECKING:
     import optuna
 
+CONFIG = "search"
+_OWN = ("search", "space")
 _FOLDER = "folder"
+_LOCK = "search.lock"  # held by the search whose trial it is: the training takes its own only seconds later
 _NEIGHBOURS = 3  # trials that must have come as far before a median says anything
 
 
-@dataclass(frozen=True)
-class Number:
-    """A number between two others.
+def make_search(overrides: list[str]) -> "Search":
+    """Make the search that a call asks for; checks two corners of what it may train, and writes nothing.
 
-    Attributes:
-        low: smallest value.
-        high: largest value; where both are whole numbers, so is every one between them.
-        log: whether equal factors count alike, and not equal differences.
+    Args:
+        overrides: of the command line.
+
+    Raises:
+        UserInputError: for whatever cannot work.
     """
-
-    low: float
-    high: float
-    log: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse what is no range."""
-        if not self.low < self.high:
-            raise UserInputError(f"interval({self.low:g},{self.high:g}) is no range: give the smaller value first")
-        if self.log and self.low <= 0:
-            raise UserInputError(f"interval({self.low:g},{self.high:g}) has no logarithm: begin above 0")
-
-    def suggest(self, trial: "optuna.Trial", key: str) -> str:
-        """Let a trial choose, and write it as an override's value."""
-        if isinstance(self.low, int) and isinstance(self.high, int):
-            return str(trial.suggest_int(key, self.low, self.high, log=self.log))
-        return repr(trial.suggest_float(key, self.low, self.high, log=self.log))
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of several values, written as on the command line."""
-
-    values: tuple[str, ...]
-
-    @property
-    def low(self) -> str:
-        """The first value."""
-        return self.values[0]
-
-    @property
-    def high(self) -> str:
-        """The last value."""
-        return self.values[-1]
-
-    def suggest(self, trial: "optuna.Trial", key: str) -> str:
-        """Let a trial choose, and write it as an override's value."""
-        value = trial.suggest_categorical(key, self.values)
-        assert isinstance(value, str)
-        return value
-
-
-Searched = Number | Choice
+    own = [override for override in overrides if key_of(override).split(".")[0] in _OWN]
+    values = plain(compose(CONFIG, own))
+    settings = read(SearchSettings, values["search"], "search")
+    given = {key_of(o): o for o in [*values["space"]["values"], *overrides] if o not in own}
+    for key in given:
+        if key == "resume" or key.startswith("hydra"):
+            raise UserInputError(f"{given[key]} has no effect on a search: leave it out")
+    searched = {o.get_key_element(): searched_in(o) for o in parse(list(given.values())) if o.is_sweep_override()}
+    if not searched:
+        raise UserInputError("nothing is searched: choose space=<name>, or give a key a value such as interval(0,1)")
+    fixed = [o for o in given.values() if not parse([o])[0].is_sweep_override()]
+    for end in ("low", "high"):
+        cfg = compose("train", [*fixed, *(f"{key}={getattr(kind, end)}" for key, kind in searched.items())])
+        check_training(cfg)
+    folder = Path("multirun") / f"search-{settings.name}"
+    trial = Job("", None, cfg.algo.name, cfg.sensor.name, cfg.seed, tuple(fixed), evaluate=None, folder=folder)
+    return Search(folder, settings, trial, searched)
 
 
 class Search:
@@ -112,16 +88,15 @@ class Search:
     def study(self) -> "optuna.Study":
         """Optuna's study, made or loaded."""
         import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
+
+        from rcdsac_trl.experiments.journal import open_journal
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         settings = self.settings
         self.folder.mkdir(parents=True, exist_ok=True)
-        journal = JournalFileBackend(str(self.folder / "optuna.journal"))
         study = optuna.create_study(
             study_name=settings.name,
-            storage=settings.storage or JournalStorage(journal),
+            storage=settings.storage or open_journal(self.folder / "optuna.journal"),
             direction="maximize",
             load_if_exists=True,
             pruner=optuna.pruners.MedianPruner(
@@ -155,21 +130,25 @@ class Search:
 
     def _take_up_what_was_lost(self) -> None:
         """Put trials whose process is gone in line again, to go on in their folders."""
-        import optuna
+        from optuna.trial import TrialState
 
-        for trial in self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)):
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING, TrialState.WAITING))
+        in_line = {trial.user_attrs.get(_FOLDER) for trial in trials if trial.state == TrialState.WAITING}
+        for trial in trials:
             folder = trial.user_attrs.get(_FOLDER)
-            if folder is None or self._is_alive(self.folder / folder):
+            if trial.state == TrialState.WAITING or folder is None or self._is_alive(self.folder / folder):
                 continue
-            self.study.enqueue_trial(trial.params, user_attrs={_FOLDER: folder})
-            self.study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+            if folder not in in_line:  # else whoever put it there was stopped before it could say so
+                self.study.enqueue_trial(trial.params, user_attrs={_FOLDER: folder})
+            self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
 
     @staticmethod
     def _is_alive(folder: Path) -> bool:
         if not folder.is_dir():
             return False
         try:
-            FolderLock(folder).close()
+            for name in (_LOCK, "lock"):  # a training that lost its search ends with its checkpoint
+                FolderLock(folder, name).close()
         except UserInputError:
             return True
         return False
@@ -190,12 +169,20 @@ class Search:
                     trial.report(value, iteration)
             return bool(reported) and trial.should_prune()
 
-        return execute(job, should_stop=is_hopeless)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock = FolderLock(folder, _LOCK)
+        except UserInputError as error:  # two searches took it up at the same moment
+            return State("failed", str(error))
+        try:
+            return execute(job, should_stop=is_hopeless)
+        finally:
+            lock.close()
 
     def _values(self, folder: Path) -> dict[int, float]:
         """Read what each validation of a run is worth, by iterations done."""
         try:
-            rows = pd.read_csv(folder / "validation_episodes.csv").dropna(subset=["collisions", "reward"])
+            rows = read_growing(folder / "validation_episodes.csv").dropna(subset=["collisions", "reward"])
         except (OSError, ValueError, KeyError):  # not there yet, or being written
             return {}
         worth = rows["reward"] - self.settings.collision_cost * rows["collisions"]
@@ -218,10 +205,10 @@ class Search:
         return value
 
     def _described(self, trial: "optuna.Trial", state: State, value: float | None) -> str:
-        told = f" ({state.sentence})" if state.sentence is not None else ""
+        reason = f" ({state.sentence})" if state.sentence is not None else ""
         ended = "pruned" if state.name == "stopped" else state.name
         worth = "" if value is None else f" {value:.1f}"
-        return f"{ended}{worth} {trial.user_attrs[_FOLDER]}: {self._as_overrides(trial.params)}{told}"
+        return f"{ended}{worth} {trial.user_attrs[_FOLDER]}: {self._as_overrides(trial.params)}{reason}"
 
     @staticmethod
     def _as_overrides(params: Mapping[str, object]) -> str:

@@ -2,13 +2,6 @@
 
 A sweep is a folder with an index of its runs, ``sweep.json``, and one run folder for each. How a run stands is written
 in the run's own folder (``state.json``), by whoever runs it, on whichever machine: nothing is said in two places.
-
-Public names::
-
-    Job, State      a run of a sweep, and how it stands
-    Sweep           runs jobs through a launcher
-    execute         runs one job where it is called
-    runs_of         what a sweep folder holds, for those who read results
 """
 
 import json
@@ -152,8 +145,8 @@ def _call(
 
 def _last_line(path: Path) -> str:
     lines = path.read_text(errors="replace").split("\n")
-    told = [line.rpartition("\r")[2].strip() for line in lines if line.strip()]
-    return told[-1].removeprefix("rcdsac_trl: ") if told else "it said nothing"
+    messages = [line.rpartition("\r")[2].strip() for line in lines if line.strip()]
+    return messages[-1].removeprefix("rcdsac_trl: ") if messages else "it said nothing"
 
 
 def _quoted(path: Path) -> str:
@@ -200,8 +193,8 @@ class Sweep:
         failed: list[tuple[Job, State]] = []
         for job, state in self.launcher.run(jobs) if jobs else ():
             done += 1
-            told = f" ({state.sentence})" if state.sentence is not None else ""
-            print(f"{done}/{len(self.jobs)} {state.name} {job.name}{told}", flush=True)
+            reason = f" ({state.sentence})" if state.sentence is not None else ""
+            print(f"{done}/{len(self.jobs)} {state.name} {job.name}{reason}", flush=True)
             if state.name == "interrupted":  # the job had the Ctrl-C that was meant for all
                 raise KeyboardInterrupt
             if state.name != "finished":

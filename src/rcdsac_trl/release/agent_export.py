@@ -5,7 +5,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.config.run_config import export_settings
+from rcdsac_trl.config.evaluation_settings import ExportSettings
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.deploy.export.exported import LIMIT, check_extra, differences, export_agent
 from rcdsac_trl.deploy.policy.weights import Weights, packed
 from rcdsac_trl.errors import FaultError, UserInputError
@@ -50,6 +51,7 @@ class Export:
         # The config comes last: a folder that has one is complete.
         for name, content in (exported.files | packed(self.weights)).items():
             atomic.write(self.out / name, content)
+        print(f"wrote {self.out}")
         return found
 
 
@@ -59,7 +61,7 @@ def make_export(cfg: DictConfig) -> Export:
     Raises:
         UserInputError: for a missing run or package, or a folder that holds something.
     """
-    settings = export_settings(cfg)
+    settings = read_config(cfg, ExportSettings)
     check_extra()
     assert settings.run is not None
     weights = weights_of_run(Path(settings.run), settings.checkpoint)

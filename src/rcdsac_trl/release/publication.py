@@ -1,20 +1,22 @@
 """Agents that are shipped: small weights with a card, and the tables that say how they learnt and drive."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rcdsac_trl.config.evaluation_settings import Name
+from omegaconf import DictConfig
+
+from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.deploy import Policy
 from rcdsac_trl.deploy.policy.weights import Weights, halved, packed
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.release.run_weights import weights_of_run
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.storage import atomic
-
-Describe = Callable[[Path], str]
-"""What a card says of an evaluation, whose folder it is given."""
+from rcdsac_trl.system.resources import check_writable
 
 # What stays of a run, where it has it: enough for every table and figure of a report.
 _TABLES = ("config.yaml", "training_episodes.csv", "validation_episodes.csv", "csv/scalars/time/elapsed_s.csv")
@@ -52,8 +54,12 @@ class Publication:
     weights: Path
     results: Path
 
-    def run(self, describe: Describe) -> Iterator[str]:
-        """Write all of them, and yield a sentence on each."""
+    def run(self, describe: Callable[[Path], str]) -> None:
+        """Write all of them, and print a sentence on each.
+
+        Args:
+            describe: returns what a card says of an evaluation, whose folder it is given.
+        """
         for name, agent in self.agents.items():
             small = halved(agent.weights)
             differs = _largest_difference(agent.weights, small)
@@ -72,10 +78,32 @@ class Publication:
             for file, content in files.items():
                 atomic.write(self.weights / name / file, content)
             size = sum(map(len, files.values()))
-            yield f"{name}: {size / 1e6:.1f} MB; half precision changes its speeds by at most {differs:.1e} m/s"
+            print(f"{name}: {size / 1e6:.1f} MB; half precision changes its speeds by at most {differs:.1e} m/s")
 
 
-def evaluation_of(run: Path, checkpoint: Name) -> Path:
+def make_publication(cfg: DictConfig) -> Publication:
+    """Make a publication; refuses before anything is written.
+
+    Raises:
+        UserInputError: for a run that is missing or not evaluated, two of one name, or a name that is taken.
+    """
+    settings = read_config(cfg, PublishSettings)
+    agents: dict[str, Published] = {}
+    for run in map(Path, settings.runs):
+        weights = weights_of_run(run, settings.checkpoint)
+        name = f"{weights.config.name}-{weights.config.sensor}"
+        if name in agents:
+            raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
+        agents[name] = Published(run, weights, _evaluation_of(run, settings.checkpoint))
+    for folder in (Path(settings.weights), Path(settings.results)):
+        check_writable(folder)
+        for name in agents:
+            if (folder / name).exists():
+                raise UserInputError(f"{folder / name} exists: remove it, or publish into another folder")
+    return Publication(agents, Path(settings.weights), Path(settings.results))
+
+
+def _evaluation_of(run: Path, checkpoint: Name) -> Path:
     """Return the evaluation of a run that is published: of that checkpoint, on evaluation maps, with most episodes.
 
     Raises:
@@ -83,9 +111,10 @@ def evaluation_of(run: Path, checkpoint: Name) -> Path:
     """
     found = {}
     for path in sorted(run.glob("evaluation/*/evaluation.json")):
-        told = json.loads(path.read_bytes())
-        if told["checkpoint"] == checkpoint and told["split"] == "evaluation" and not told.get("controller"):
-            found[path.parent] = told["num_maps"] * told["num_episodes"]
+        described = json.loads(path.read_bytes())
+        measured = described["checkpoint"], described["split"]
+        if measured == (checkpoint, "evaluation") and not described.get("controller"):
+            found[path.parent] = described["num_maps"] * described["num_episodes"]
     if not found:
         raise UserInputError(
             f"{run} has no evaluation of its checkpoint {checkpoint}: "

@@ -12,6 +12,7 @@ from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import CHECKPOINTS, AgentOfRun, agent_of_run
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Context, Weights
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.storage.checkpoint import load_states
 from rcdsac_trl.storage.checkpoint_record import Progress
@@ -30,9 +31,15 @@ def weights_of_run(folder: Path, checkpoint: Name) -> Weights:
         checkpoint: ``"best"``, ``"last"``, or the iterations done.
 
     Raises:
-        UserInputError: if there is no such run or checkpoint, or its weights do not fit its config.
+        UserInputError: if there is no such run or checkpoint, its weights do not fit its config, or it has an encoder
+            of its own.
     """
     agent = agent_of_run(folder)
+    if agent.network.encoder is not None:
+        raise UserInputError(
+            f"{folder} has network.encoder={agent.network.encoder}, and weights folders hold our own encoder alone: "
+            "export its actor from Python, as docs/agent.md shows"
+        )
     saved, states, damaged = load_states(folder / CHECKPOINTS, checkpoint)
     for sentence in damaged:
         print(f"rcdsac_trl: {sentence}", file=sys.stderr)
@@ -72,11 +79,12 @@ def _config(agent: AgentOfRun, num_critics: int, provenance: dict[str, str | int
         measure=algo.distortion.name,
         embedding=None if measure is None else _embedding(measure),
         fixed_beta=algo.beta,
-        network=vars(agent.network),
+        network=agent.network.widths,
         period_s=(min(task.motor_steps) * MOTOR_PERIOD_S, max(task.motor_steps) * MOTOR_PERIOD_S),
         waypoint_radius_m=task.waypoint_radius_m,
         goal_radius_m=task.goal_radius_m,
         provenance=provenance,
+        padding=agent.network.padding,
     )
 
 

@@ -1,16 +1,36 @@
 """The paper's table, statistics and figures of evaluations: ``python -m rcdsac_trl.report runs=[<folder>,...]``."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.cli import entry_point
+from rcdsac_trl.cli import Command
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.system.resources import check_writable
 
 
-def _read(cfg: DictConfig) -> tuple[Episodes, list[Path], Path]:
+@dataclass(frozen=True)
+class Report:
+    """A report that is about to be written: on which episodes, of which folders, where."""
+
+    episodes: Episodes
+    folders: list[Path]
+    out: Path
+
+    def run(self) -> None:
+        """Write the report and print the table."""
+        from rcdsac_trl.report import table
+        from rcdsac_trl.report.write import write_report
+
+        write_report(self.episodes, self.folders, self.out)
+        print(table.flattened(table.comparison(self.episodes)).to_string(index=False))
+        print(f"written to {self.out}")
+
+
+def make_report(cfg: DictConfig) -> Report:
+    """Read evaluations; refuses what cannot be compared, before anything is written."""
     runs = cfg.runs
     named = [runs] if isinstance(runs, str) else list(runs or [])
     folders = [Path(str(run)) for run in named]
@@ -18,25 +38,10 @@ def _read(cfg: DictConfig) -> tuple[Episodes, list[Path], Path]:
     if out.exists() and not out.is_dir():
         raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
     check_writable(out)
-    return read_episodes(folders), folders, out
+    return Report(read_episodes(folders), folders, out)
 
 
-def check(cfg: DictConfig) -> None:
-    """Refuse what cannot be compared, before anything is written."""
-    _read(cfg)
-
-
-@entry_point("report", check=check)
-def main(cfg: DictConfig) -> None:
-    """Write the report and print the table."""
-    from rcdsac_trl.report import table
-    from rcdsac_trl.report.write import write_report
-
-    episodes, folders, out = _read(cfg)
-    write_report(episodes, folders, out)
-    print(table.flattened(table.comparison(episodes)).to_string(index=False))
-    print(f"written to {out}")
-
+main = Command("report", make_report)
 
 if __name__ == "__main__":
     main()

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from rcdsac_trl.report import statistics
-from rcdsac_trl.report.findings import TAILS, labels
+from rcdsac_trl.report.findings import TAILS, bounded, labels
 from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.statistics import Statistic
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, shades, style
@@ -43,7 +43,7 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
         return None
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     figure.suptitle(
-        f"What β does ({measure}): averse at the left; 95 % intervals over maps",
+        f"What β does ({measure}): averse at the left; 95 % intervals over maps (and seeds, where there are several)",
         x=0.01,
         ha="left",
         fontsize=13,
@@ -56,9 +56,7 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
             values = [episodes.of(condition, metric) for _, condition in ordered.iterrows()]
             marker = MARKERS[number % len(MARKERS)]
             name = ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
-            _draw_intervals(
-                axes, ordered["beta"], [statistics.bootstrap(v, statistic) for v in values], color, marker, name
-            )
+            _draw_intervals(axes, ordered["beta"], [bounded(v, metric, statistic) for v in values], color, marker, name)
             _draw_turned(axes, episodes, rows.iloc[0], metric, statistic, color)
             if metric == "reward":
                 axes.plot(
@@ -160,7 +158,7 @@ def _draw_turned(
     same = (conditions["agent"] == of["agent"]) & (conditions["sensor"] == of["sensor"])
     for _, condition in conditions[same & conditions["beta_controller"].notna()].iterrows():
         beta = statistics.mean(episodes.of(condition, "mean_beta"))
-        found = statistics.bootstrap(episodes.of(condition, metric), statistic)
+        found = bounded(episodes.of(condition, metric), metric, statistic)
         axes.plot([beta, beta], [found.low, found.high], color=color, linewidth=1.2)
         axes.plot(beta, found.value, marker="*", markersize=11, color=color, markeredgecolor="white", linestyle="none")
         name = condition["beta_controller"].replace("_", " ")

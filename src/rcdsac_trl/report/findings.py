@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 
 from rcdsac_trl.report import statistics
-from rcdsac_trl.report.read import CONDITION, Episodes
-from rcdsac_trl.report.statistics import Interval, Statistic
+from rcdsac_trl.report.read import CONDITION, Episodes, possible
+from rcdsac_trl.report.statistics import Array, Interval, Statistic
 from rcdsac_trl.report.table import condition_label
 
 TAILS = (0.1, 0.25)
@@ -32,13 +32,18 @@ def labels(episodes: Episodes) -> list[str]:
     return [condition_label(agent, name, beta, weight, by, sensors) for agent, name, beta, weight, by in rows]
 
 
+def bounded(values: Array, metric: str, statistic: Statistic = statistics.mean) -> Interval:
+    """Return a statistic of a metric and its interval, none of it outside of what the metric can be."""
+    return statistics.bootstrap(values, statistic).within(*possible(metric))
+
+
 def summary(episodes: Episodes) -> pd.DataFrame:
     """Return `condition`, `statistic`, `value`, `low`, `high`: every metric's mean, and :data:`SUMMARISED`."""
     rows = []
     for (_, condition), label in zip(episodes.conditions.iterrows(), labels(episodes), strict=True):
         wanted = {metric: (metric, statistics.mean) for metric in episodes.metrics} | SUMMARISED
         for name, (metric, statistic) in wanted.items():
-            interval = statistics.bootstrap(episodes.of(condition, metric), statistic)
+            interval = bounded(episodes.of(condition, metric), metric, statistic)
             rows.append({"condition": label, "statistic": name} | vars(interval))
     return pd.DataFrame(rows)
 
@@ -85,6 +90,8 @@ def comparisons(episodes: Episodes) -> pd.DataFrame:
 
 def trends(episodes: Episodes) -> pd.DataFrame:
     """Test whether metrics go with beta, for each agent that was driven at three values of it or more.
+
+    Maps are the blocks, so the test speaks of the agents that were driven, also where they are of several seeds.
 
     Returns:
         `agent`, `sensor`, `metric`, `settings`, `correlation` and `p_value`, see

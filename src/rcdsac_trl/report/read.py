@@ -1,6 +1,7 @@
 """What evaluations and trainings left behind, checked to be comparable."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,6 +38,19 @@ METRIC_NAMES: dict[str, str] = {
     "smallest_clearance_m": "smallest clearance, m",
 }
 """Metrics in the order of reports, and what they are called there."""
+_SHARES = ("contact_fraction", "collision_free", "success", "collided", "timed_out", "spl")
+
+
+def possible(metric: str) -> tuple[float, float]:
+    """Return the smallest and the largest value that a metric can have.
+
+    Example:
+        >>> possible("collisions")
+        (0.0, inf)
+    """
+    if metric in _SHARES:
+        return 0.0, 1.0
+    return (-math.inf if metric == "reward" else 0.0), math.inf
 
 
 @dataclass(frozen=True)

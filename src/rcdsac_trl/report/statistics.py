@@ -1,7 +1,10 @@
 """Statistics of episodes. The map is the unit: its episodes share walls, clutter and difficulty, so they are not so
 many independent observations.
 
-Values come as arrays ``[S, M, E]``: training seeds, maps, episodes on a map.
+Values come as arrays ``[S, M, E]``: training seeds, maps, episodes on a map. Seeds and maps are crossed, not nested:
+the agents of all seeds met the same maps. So a resample draws its maps once, for all seeds. The seeds themselves are
+few, and resampling few values gives intervals that are too narrow (95 % intervals of two seeds hold the truth half of
+the time): what seeds add to an error is taken from Student's t distribution.
 """
 
 from collections.abc import Callable
@@ -30,6 +33,15 @@ class Interval:
     value: float
     low: float
     high: float
+
+    def within(self, lowest: float, highest: float) -> "Interval":
+        """Leave out what cannot be: few seeds can make an interval of collisions begin below zero.
+
+        Example:
+            >>> Interval(0.5, -0.2, 1.2).within(0.0, 9.9)
+            Interval(value=0.5, low=0.0, high=1.2)
+        """
+        return Interval(self.value, max(self.low, lowest), min(self.high, highest))
 
 
 @dataclass(frozen=True)
@@ -103,46 +115,54 @@ def cvar(share: float) -> Statistic:
 
 
 def bootstrap(values: Array, statistic: Statistic = mean) -> Interval:
-    """Return a statistic of all episodes and its percentile interval.
+    """Return a statistic of all episodes and its confidence interval.
 
-    Levels are resampled from the outside in: training seeds, where there are several, then maps within each seed; the
-    episodes of a map stay together.
+    Resamples draw maps, the same ones for all training seeds; the episodes of a map stay together. Where there are
+    several seeds, each resample also gets an :func:`error of the seeds <_errors_of_seeds>`, from how far the statistic
+    of one seed lies from another's: the interval then speaks of the recipe, else of the one agent. Its bounds are
+    percentiles of the resamples.
 
     Args:
         values: ``[S, M, E]``.
         statistic: of an array of any shape.
     """
-    rng = np.random.default_rng(_SEED)
-    seeds, maps, _ = values.shape
-    seed = rng.integers(seeds, size=(DRAWS, seeds, 1))
-    map_ = rng.integers(maps, size=(DRAWS, seeds, maps))
+    chosen, _ = _resamples(values.shape[1], DRAWS, PERMUTATIONS)
     if statistic is mean:  # of all draws at once, from the sums of maps
-        counts, sums = np.isfinite(values).sum(2), np.nansum(values, 2)
-        totals = counts[seed, map_].sum((1, 2))
-        drawn = np.divide(sums[seed, map_].sum((1, 2)), totals, out=np.full(DRAWS, np.nan), where=totals > 0)
+        counts, sums = np.isfinite(values).sum((0, 2)), np.nansum(values, (0, 2))
+        totals = counts[chosen].sum(1)
+        drawn = np.divide(sums[chosen].sum(1), totals, out=np.full(DRAWS, np.nan), where=totals > 0)
     else:
-        drawn = np.array([statistic(values[seed[i], map_[i]]) for i in range(DRAWS)])
-    return _interval(statistic(values), drawn)
+        drawn = np.array([statistic(values[:, maps]) for maps in chosen])
+    of_seeds = np.array([statistic(values[seed]) for seed in range(len(values))])
+    return _interval(statistic(values), drawn + _errors_of_seeds(DRAWS, of_seeds))
 
 
 def compare(first: Array, second: Array) -> Comparison:
     """Compare two sets of episodes on the same maps.
 
-    Intervals resample maps, for both sides at once. The test permutes, map by map, which side is which (the mean of
-    a map over seeds and episodes is one observation): exact, and without an assumption about the distribution.
+    Intervals resample maps, for both sides and all seeds at once. The test permutes, map by map, which side is which
+    (the mean of a map over seeds and episodes is one observation): exact, and without an assumption about the
+    distribution. A side with several training seeds adds an :func:`error of the seeds <_errors_of_seeds>` to every
+    resample and permutation. With as many seeds on both sides, the errors are those of the differences seed by seed:
+    what two settings of the same agents have in common cancels, and where the agents are others no harm is done.
 
     Args:
         first: ``[S, M, E]``.
-        second: ``[S', M, E]``, the same maps, starts and goals.
+        second: ``[S', M, E]``, the same maps, starts and goals; seeds in the same order.
     """
     differences = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
+    maps = len(differences)
+    chosen, signs = _resamples(maps, DRAWS, PERMUTATIONS)
+    of_seeds = np.nanmean(first, axis=(1, 2)), -np.nanmean(second, axis=(1, 2))
+    drawn = differences[chosen].mean(1) + _errors_of_seeds(DRAWS, *of_seeds)
+    permuted = signs @ differences + maps * _errors_of_seeds(PERMUTATIONS, *of_seeds)
     improvements = _improvements(first, second)
-    chosen, signs = _resamples(len(differences), DRAWS, PERMUTATIONS)
-    as_extreme = np.abs(signs @ differences) >= abs(differences.sum()) - 1e-9
+    improved = improvements.mean((0, 1))[chosen].mean(1)
+    improved += _errors_of_seeds(DRAWS, improvements.mean((1, 2)), improvements.mean((0, 2)))
     return Comparison(
-        difference=_interval(differences.mean(), differences[chosen].mean(1)),
-        improvement=_interval(improvements.mean(), improvements[chosen].mean(1)),
-        p_value=_p_value(as_extreme),
+        difference=_interval(differences.mean(), drawn),
+        improvement=_interval(improvements.mean(), np.clip(improved, 0.0, 1.0)),
+        p_value=_p_value(np.abs(permuted) >= abs(differences.sum()) - 1e-9),
     )
 
 
@@ -199,11 +219,36 @@ def _resamples(maps: int, draws: int, permutations: int) -> tuple[NDArray[np.int
     return rng.integers(maps, size=(draws, maps)), rng.choice([-1.0, 1.0], size=(permutations, maps))
 
 
+def _errors_of_seeds(number: int, *of_seeds: Array) -> Array:
+    """Draw by how much other training seeds would have changed a result.
+
+    The error of a mean over S seeds is their standard deviation times Student's t with S - 1 degrees of freedom, over
+    the square root of S. The quantiles of t are drawn evenly, so that its far tails do not depend on luck.
+
+    Args:
+        number: how many errors.
+        of_seeds: for each side of a comparison what each of its seeds adds, ``[S]``; sides with as many seeds are added
+            up seed by seed, others are independent. NaN is a seed on which nothing was measured.
+
+    Returns:
+        ``[number]``; zero for a side with one seed, whose spread nobody knows.
+    """
+    if len({len(side) for side in of_seeds}) == 1:
+        of_seeds = (np.sum(of_seeds, axis=0),)
+    rng = np.random.default_rng([_SEED, 1])  # independent of the maps drawn
+    errors = np.zeros(number)
+    for side in of_seeds:
+        measured = side[np.isfinite(side)]
+        if len(measured) > 1:
+            t = stats.t.ppf((np.arange(number) + 0.5) / number, len(measured) - 1)
+            errors += rng.permutation(t) * measured.std(ddof=1) / len(measured) ** 0.5
+    return errors
+
+
 def _improvements(first: Array, second: Array) -> Array:
-    """Return, for each map, the share of pairs of episodes in which the first is larger: [M]."""
-    a, b = (np.moveaxis(values, 1, 0).reshape(values.shape[1], -1) for values in (first, second))
-    pairs = a[:, :, None] - b[:, None, :]
-    return ((pairs > 0) + 0.5 * (pairs == 0)).mean((1, 2))
+    """Return the share of pairs of episodes in which the first is larger, ``[S, S', M]``: of two seeds on a map."""
+    pairs = first[:, None, :, :, None] - second[None, :, :, None, :]
+    return ((pairs > 0) + 0.5 * (pairs == 0)).mean((3, 4))
 
 
 def _interval(value: float, drawn: Array) -> Interval:

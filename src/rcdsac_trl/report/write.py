@@ -18,8 +18,8 @@ _ADAPTIVE = (
     "by these very episodes, which favours it a little. p-values are adjusted by Holm's method for the number of "
     "controllers.",
     "clearance: by the nearest thing the sensor sees. tail_variance: by the lower tail of the return that the critics "
-    "expect. bandit: one beta an episode, chosen by the returns of the episodes before, over the maps in their order; "
-    "so its maps are not independent, and its interval and p-value are a rough guide.",
+    "expect. bandit (of earlier versions): one beta an episode, chosen by the returns of the episodes before, over the "
+    "maps in their order; so its maps are not independent, and its interval and p-value are a rough guide.",
 )
 
 
@@ -117,11 +117,12 @@ def _sections(
             "What beta does",
             [
                 "Shaded: where the value lies with "
-                f"{CONFIDENCE:.0%} confidence, if other maps of the same kind had been drawn.",
+                f"{CONFIDENCE:.0%} confidence, if other maps of the same kind had been drawn, and other training "
+                "seeds, where there are several.",
                 *(figure for name, figure in figures.items() if name.startswith("beta_response")),
                 "Does it hold map by map? Page's test for an order, maps as blocks. Correlation 1 means that the "
                 f"metric rises with beta on every map, -1 that it falls on every map. p-values by {PERMUTATIONS:,} "
-                "permutations within the maps, two-sided, one test at a time.",
+                "permutations within the maps, two-sided, one test at a time. They speak of these trained agents.",
                 _text(trends) if len(trends) else "No agent was driven at three betas or more.",
             ],
         ),
@@ -130,9 +131,9 @@ def _sections(
             [
                 *(figure for name, figure in figures.items() if name.startswith("differences")),
                 "The column better is the probability that an episode of the first agent beats one of the second on "
-                "the same map (fewer collisions, more reward). p-values: sign permutations over maps, adjusted by "
-                "Holm's method for the number of pairs. With one training seed they speak of these trained agents, "
-                "not of the algorithms.",
+                "the same map (fewer collisions, more reward). p-values: sign permutations over maps, with the error "
+                "of the training seeds where there are several, adjusted by Holm's method for the number of pairs. "
+                "With one training seed they speak of these trained agents, not of the algorithms.",
                 _text(shown) if len(shown) else "There is only one agent.",
                 "All other pairs are in comparisons.csv.",
             ],

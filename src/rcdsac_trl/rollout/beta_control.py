@@ -3,19 +3,15 @@
 from collections.abc import Sequence
 
 import numpy as np
-import pandas as pd
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from rcdsac_trl.deploy.policy.beta_controllers import BanditBeta, BetaController
+from rcdsac_trl.deploy.policy.beta_controllers import BetaController
 from rcdsac_trl.robot.observation import range_distances
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
-
-BANDIT = "bandit"
-"""The controller that is played on episodes which were driven, see :func:`play_bandit`."""
 
 
 class AdaptivePolicy(TensorDictModuleBase):
@@ -66,28 +62,3 @@ class AdaptivePolicy(TensorDictModuleBase):
     def mean_betas(self) -> Tensor:
         """Return the mean over the steps since the last reset, ``[N]``."""
         return torch.stack(self.told).mean(0)
-
-
-def play_bandit(episodes: pd.DataFrame, bandit: BanditBeta) -> pd.DataFrame:
-    """Let a bandit learn over the episodes of an evaluation, in the order of their maps and numbers.
-
-    All of its betas were driven in every episode, and a beta that holds for an episode leads to the same episode
-    whoever chose it: so what the bandit would have met is known, and none of it has to be driven again. It sees the
-    reward of its own choice alone, and what it learns does not depend on which process drove which map.
-
-    Args:
-        episodes: one row an episode, with `beta`, `map`, `episode` and `reward`.
-        bandit: is reset before every episode and learns from it.
-
-    Returns:
-        One row an episode, as driven under the beta chosen, with `beta` missing, that beta in `mean_beta`, and
-        `beta_controller`.
-    """
-    driven = {(row["map"], row["episode"], row["beta"]): row for row in episodes.to_dict("records")}
-    rows = []
-    for map_, episode in sorted({(map_, episode) for map_, episode, _ in driven}):
-        bandit.reset()
-        row = driven[map_, episode, bandit.beta]
-        bandit.learn(row["reward"])
-        rows.append(row | {"beta": float("nan"), "beta_controller": BANDIT, "mean_beta": bandit.beta})
-    return pd.DataFrame(rows)

@@ -4,9 +4,11 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 
+from rcdsac_trl.rollout.env_workers import EnvWorkers
 from rcdsac_trl.rollout.worker_processes import Request, Teams
 from rcdsac_trl.system.processes import WorkerError
 
@@ -68,6 +70,7 @@ class CollectorEpisodes:
         set_iteration: told the iteration whose episodes are about to be collected.
         iteration: the first one.
         map_index: the number of its map.
+        workers: the processes of its environment.
     """
 
     def __init__(
@@ -77,9 +80,11 @@ class CollectorEpisodes:
         *,
         iteration: int,
         map_index: int,
+        workers: EnvWorkers,
     ) -> None:
         self._make = make
         self._set_iteration = set_iteration
+        self._workers = workers
         self._collector: Collector | None = None
         self._batches: Iterator[TensorDictBase] = iter(())
         self._start(iteration, map_index)
@@ -94,15 +99,27 @@ class CollectorEpisodes:
         except WorkerError:
             self.close()
             raise
+        except (RuntimeError, EOFError, OSError) as error:
+            fault = self._workers.fault(error)
+            if fault is None:
+                raise
+            self._workers.kill()
+            self.close()
+            raise fault from error
         return batch.reshape(-1, batch.shape[-1])
 
     def _start(self, iteration: int, map_index: int) -> None:
+        self._workers.before_start()
         self._collector = self._make(iteration, map_index)
+        self._workers.started()
         self._batches = iter(self._collector)
 
     def close(self) -> None:
         """See :class:`Episodes`."""
+        threads = torch.get_num_threads()
         if self._collector is not None:
             with contextlib.suppress(Exception):
                 self._collector.shutdown(raise_on_error=False)
         self._collector = None
+        self._workers.kill()
+        torch.set_num_threads(threads)  # a ParallelEnv changes it when it is closed

@@ -26,29 +26,20 @@ def packed(actor: nn.Module) -> bytes:
 
 def make_loss(settings: TrainingSettings, device: str) -> LossModule:
     """Make actor, critics and their loss, with weights from the stream ``"weights"``."""
-    algo, learner, widths = settings.algo, settings.learner, settings.network
+    algo, learner, network = settings.algo, settings.learner, settings.network
     # Layers draw their first weights from torch's global generator: lend it our stream, and give it back.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(torch_seed(settings.seed, "weights"))
         actor = _build_actor(settings)
         critics = [
-            build_critic(ACTION_SIZE, _vectors(settings), algo.critic, algo.network_measure, widths)
+            build_critic(ACTION_SIZE, _vectors(settings), algo.critic, algo.network_measure, network)
             for _ in range(learner.num_critics)
         ]
     loss = DistributionalSACLoss(
         actor.to(device),
         [critic.to(device) for critic in critics],
+        learner,
         measure=algo.distortion.measure,
-        num_quantiles=learner.num_quantiles,
-        num_target_quantiles=learner.num_target_quantiles,
-        num_risk_samples=learner.num_risk_samples,
-        fractions_per=learner.fractions_per,
-        fraction_sampling=learner.fraction_sampling,
-        kappa=learner.kappa,
-        alpha_init=learner.alpha_init,
-        target_entropy=learner.target_entropy,
-        burn_in=learner.burn_in,
-        target_over_critics=learner.target_over_critics,
         generator=torch_stream(settings.seed, "loss", device=device),
     ).to(device)
     loss.make_value_estimator(gamma=learner.gamma)

@@ -3,18 +3,16 @@
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 import safetensors.torch
 import torch
-from numpy.typing import NDArray
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.rollout.env_workers import EnvWorkers
 from rcdsac_trl.rollout.environments import environment, team
 from rcdsac_trl.rollout.episode_collectors import CollectorEpisodes, Episodes, TeamEpisodes
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, packed
@@ -24,9 +22,9 @@ from rcdsac_trl.rollout.worker_processes import Drive, LocalTeam, MakeDrive, Req
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.extras import needs
-from rcdsac_trl.system.processes import largest_divisor, resolve_processes
+from rcdsac_trl.system.processes import largest_divisor, resolve_num_workers, resolve_processes
 from rcdsac_trl.world.maps.generator import Split
-from rcdsac_trl.world.task.spaces import ACTION_SIZE, AGENT_OBSERVATIONS, SPACES
+from rcdsac_trl.world.task.spaces import AGENT_OBSERVATIONS
 
 SPLIT: Split = "train"
 # What the replay and the metrics read of a step, beside the observations.
@@ -53,8 +51,6 @@ def check_collector(settings: TrainingSettings) -> None:
     """
     if settings.collector.name == "ray":
         needs("ray", "collector=ray", extra="ray", instead="collector=multi")
-    if settings.collector.slurm is not None:
-        needs("submitit", "collector.slurm", extra="slurm", instead="collector.slurm=null")
 
 
 def _multi(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
@@ -85,42 +81,6 @@ def _ray(settings: TrainingSettings, actor: TensorDictSequential, device: str, p
         return RayTeams(shares, address=settings.collector.address, cores=cores, timeout_s=given.worker_timeout_s)
 
     return TeamEpisodes(teams, lambda: packed(actor))
-
-
-def _distributed(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
-    """Share the agents out over processes of a group; they drive on the CPU, wherever the learner is."""
-    from rcdsac_trl.rollout.distributed_workers import DistributedTeams
-
-    given, slurm = settings.world, settings.collector.slurm
-    number = settings.collector.num_processes
-    processes = largest_divisor(given.num_agents, usable_cores()) if number == "auto" else number
-    options: dict[str, Any] = {"slurm_cpus_per_task": 1, "slurm_gpus_per_node": 0}
-    if slurm is not None:
-        options |= {"timeout_min": slurm.timeout_min, "slurm_partition": slurm.partition}
-
-    def teams() -> Teams:
-        return DistributedTeams(
-            _shares(settings, processes),
-            _example(settings, given.num_agents // processes),
-            slurm=None if slurm is None else options,
-            timeout_s=given.worker_timeout_s,
-        )
-
-    return TeamEpisodes(teams, lambda: packed(actor))
-
-
-def _example(settings: TrainingSettings, num_agents: int) -> TensorDict:
-    """Return what a team of some agents returns, with zeros for all numbers."""
-
-    def zeros(key: str, times: int) -> NDArray:
-        return np.zeros((num_agents, times, SPACES[key].size), SPACES[key].dtype)
-
-    steps, told = settings.task.episode_steps, settings.algo.context_key
-    observed = {key: zeros(key, steps + 1) for key in AGENT_OBSERVATIONS}
-    done = {key: zeros(key, steps) for key in _HAPPENED}
-    done["action"] = np.zeros((num_agents, steps, ACTION_SIZE), np.float32)
-    whole = {} if told is None else {told: np.zeros((num_agents, 1), np.float32)}
-    return Driven(observed, done, whole).tensordict().contiguous()
 
 
 def _shares(settings: TrainingSettings, processes: int) -> dict[str, MakeDrive]:
@@ -164,7 +124,7 @@ def _team(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Driv
         agents.close()
 
 
-def _single(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
+def _by_torchrl(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> Episodes:
     """Let TorchRL's own collector drive in this process, over the workers of a ``ParallelEnv`` where there are any."""
     world, schedule = settings.training_world, settings.schedule
     agent_ids = range(world.num_agents)
@@ -192,7 +152,15 @@ def _single(settings: TrainingSettings, actor: TensorDictSequential, device: str
         )
 
     done = progress.iterations
-    return CollectorEpisodes(collector, policy.set_iteration, iteration=done, map_index=done + progress.skipped_maps)
+    workers = resolve_num_workers(world.num_workers, world.num_agents)
+    described = list(_shares(settings, workers)) if workers else []
+    return CollectorEpisodes(
+        collector,
+        policy.set_iteration,
+        iteration=done,
+        map_index=done + progress.skipped_maps,
+        workers=EnvWorkers(described, world.worker_timeout_s),
+    )
 
 
 def _collection_policy(
@@ -208,4 +176,4 @@ def _collection_policy(
     )
 
 
-_COLLECTORS = {"multi": _multi, "single": _single, "ray": _ray, "distributed": _distributed}
+_COLLECTORS = {"multi": _multi, "parallel_env": _by_torchrl, "single": _by_torchrl, "ray": _ray}

@@ -23,7 +23,9 @@ from rcdsac_trl.rollout.evaluation_pool import Drive, Rows
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, unpacked_loss
 from rcdsac_trl.rollout.measurement import measure_map
 from rcdsac_trl.rollout.navigation_metrics import trip_metrics
-from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
+from rcdsac_trl.rollout.planners.baselines import PURSUIT, baseline_policy
+from rcdsac_trl.rollout.planners.controller import ControllerPolicy
+from rcdsac_trl.rollout.policies import AgentNoise
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
 from rcdsac_trl.rollout.worker import Team
 from rcdsac_trl.system import runtime
@@ -53,6 +55,7 @@ class Course:
         threads: that torch uses for one operation while it drives.
         trips: measure the ways driven, too.
         controller: settings of controllers, which then tell all agents beta; None: nothing turns it.
+        baseline: what drives where there is no actor.
     """
 
     trained: TrainingSettings
@@ -66,6 +69,7 @@ class Course:
     threads: int
     trips: bool = False
     controller: ControllerSettings | None = None
+    baseline: str = PURSUIT
 
 
 class Agent(NamedTuple):
@@ -88,7 +92,7 @@ def driver(
 
     Args:
         course: what is driven.
-        actor: the actor's weights, packed; None: pursuit drives, which is told nothing.
+        actor: the actor's weights, packed; None: the baseline drives, which is told nothing.
         loss: the loss with the critics, packed; read where a condition's controller needs their quantiles.
         wrap: puts something around the policy, which may change nothing of what it does.
     """
@@ -100,8 +104,13 @@ def driver(
         course.world, algo, course.conditions, course.split, course.seed, course.num_episodes, memory
     )
     # An episode's noise is its own: the same under every condition, whichever they are and in whatever order.
-    noise = AgentNoise([*range(course.num_episodes)] * len(course.conditions))
-    policy = PursuitPolicy() if actor is None else _policy(course, actor, noise)
+    agent_ids = [*range(course.num_episodes)] * len(course.conditions)
+    noise = AgentNoise(agent_ids)
+    if actor is None:
+        policy = baseline_policy(course.baseline, sensor=course.world.sensor, agent_ids=agent_ids, seed=course.seed)
+    else:
+        policy = _policy(course, actor, noise)
+    planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, course)] if course.trips else []
     if course.controller is not None:
         policy = adaptive = _adaptive(course, course.controller, policy, loss)
@@ -112,6 +121,8 @@ def driver(
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         # By the map's number, so that it does not matter which process drives it.
         noise.begin(course.seed, "evaluation actions", map_index)
+        if planner is not None:
+            planner.set_map(map_index)
         return measure_map(
             team,
             policy,

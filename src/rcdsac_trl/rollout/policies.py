@@ -12,6 +12,7 @@ from torchrl.modules.distributions.utils import safetanh_noeps
 
 from rcdsac_trl.agent.actor import STATE_KEY
 from rcdsac_trl.agent.kernels.compiled_actor import CompiledActor
+from rcdsac_trl.agent.kernels.dispatch import has_compiled_actor
 from rcdsac_trl.rollout.planners.pursuit import pursuit_action
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.system.interrupts import interruption_point
@@ -64,7 +65,7 @@ class LeanPolicy(TensorDictModuleBase):
 
     On a handful of agents the modules and distributions that a ``ProbabilisticActor`` goes through cost more than the
     networks. Here the CPU does a step in one compiled pass, in which an agent's numbers do not depend on the others;
-    another device calls the two networks as they are.
+    another device, and networks that the pass does not know, run their layers.
 
     Args:
         actor: an encoder and a head, from :func:`rcdsac_trl.agent.actor.build_actor`; its weights are shared.
@@ -77,7 +78,7 @@ class LeanPolicy(TensorDictModuleBase):
         self.encoder = encoder.module
         self.head = head.module
         self.noise = noise
-        self._compiled = CompiledActor(actor)
+        self._compiled = CompiledActor(actor) if has_compiled_actor(self.encoder, self.head) else None
         self._vector_keys = encoder.in_keys[1:]  # behind the range
         self._head_keys = head.in_keys[1:]  # behind the encoder's memory
         self.in_keys = [*encoder.in_keys, "is_init", STATE_KEY, *self._head_keys]
@@ -94,13 +95,14 @@ class LeanPolicy(TensorDictModuleBase):
         range_, is_init, state = rows("range"), rows("is_init"), rows(STATE_KEY)
         vectors = [rows(key) for key in self._vector_keys]
         risk = rows(self._head_keys[0]) if self._head_keys else None
-        if range_.device.type == "cpu":
+        if self._compiled is not None and range_.device.type == "cpu":
             outputs = self._compiled.step(range_, vectors, risk, is_init, state, noise)
         else:
-            state = self.encoder.step(range_, *vectors, is_init, state)
-            loc, scale = self.head(state, risk)
-            before_tanh = loc if noise is None else loc + noise.to(loc.device) * scale
-            outputs = loc, scale, safetanh_noeps(before_tanh), state
+            with torch.no_grad():
+                memory, state = self.encoder.step(range_, *vectors, is_init, state)
+                loc, scale = self.head(memory, *([] if risk is None else [risk]))
+                before_tanh = loc if noise is None else loc + noise.to(loc.device) * scale
+                outputs = loc, scale, safetanh_noeps(before_tanh), state
         for key, value in zip(("loc", "scale", "action", ("next", STATE_KEY)), outputs, strict=True):
             tensordict.set(key, value.view(*tensordict.batch_size, -1))
         return tensordict

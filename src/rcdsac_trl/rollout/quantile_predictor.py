@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
+from rcdsac_trl.agent.kernels import dispatch
 from rcdsac_trl.deploy.policy.policy import fractions_of
 
 NUM_QUANTILES = 16
@@ -32,7 +33,7 @@ class QuantilePredictor:
         self.rows = torch.tensor(list(rows))
         self._critics = critics
         self._tau = torch.from_numpy(fractions_of(num_quantiles)).expand(len(rows), 1, -1)
-        self._memories = [torch.zeros(len(rows), critic[0].module.memory_size) for critic in critics]
+        self._states = [torch.zeros(len(rows), critic[0].module.state_size) for critic in critics]
 
     def step(self, tensordict: TensorDictBase) -> Tensor:
         """Return the quantiles ``[R, N]`` of each agent's return from its action on.
@@ -45,7 +46,7 @@ class QuantilePredictor:
         with torch.no_grad():
             for number, (encoder, head) in enumerate(self._critics):
                 seen = [tensordict[key][self.rows] for key in (*encoder.in_keys, "is_init")]
-                memory = self._memories[number] = encoder.module.step(*seen, self._memories[number])
+                memory, self._states[number] = dispatch.step(encoder.module, *seen, self._states[number])
                 entries = {
                     head.in_keys[0]: memory.unsqueeze(1),
                     "action": tensordict["action"][self.rows].unsqueeze(1),
@@ -53,7 +54,7 @@ class QuantilePredictor:
                 }
                 if "risk" in head.in_keys:
                     entries["risk"] = tensordict["risk"][self.rows].unsqueeze(1)
-                told = head.module(*[entries[key] for key in head.in_keys])[:, 0]
-                lowest = told if lowest is None else torch.minimum(lowest, told)
+                quantiles = dispatch.forward(head.module, *[entries[key] for key in head.in_keys])[:, 0]
+                lowest = quantiles if lowest is None else torch.minimum(lowest, quantiles)
         assert lowest is not None
         return lowest

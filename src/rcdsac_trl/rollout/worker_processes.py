@@ -5,25 +5,19 @@ more than driving them, and neither tells which process died or hung, nor how, n
 """
 
 import contextlib
-import multiprocessing
-import signal
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from multiprocessing.connection import Connection, wait
-from typing import Any, NamedTuple, Protocol, cast
+from functools import partial
+from typing import NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDictBase
 
 from rcdsac_trl.rollout.worker import Driven, side_by_side
 from rcdsac_trl.system.interrupts import interruption_point
-from rcdsac_trl.system.processes import START_METHOD, WorkerError, ending
+from rcdsac_trl.system.process_pool import ProcessPool
 
 _PRELOADED = "rcdsac_trl.rollout.make_collector"
-# How often a process that drives says so, and how often this one looks for Ctrl-C meanwhile.
-_ALIVE_EVERY_S = 0.25
 
 
 class Request(NamedTuple):
@@ -79,26 +73,9 @@ class TeamProcesses:
     """
 
     def __init__(self, makes: Sequence[MakeDrive], described: Sequence[str], timeout_s: float | None) -> None:
-        self._described = described
-        self._timeout_s = timeout_s
-        self._hung: set[int] = set()
-        self._connections: list[Connection] = []
-        self._processes: list[Any] = []
-        # What the processes import, imported once.
-        multiprocessing.set_forkserver_preload([_PRELOADED])
-        context: Any = multiprocessing.get_context(START_METHOD)
-        try:
-            for make in makes:
-                ours, theirs = context.Pipe()
-                # A daemon is ended with this process, however that ends.
-                process = context.Process(target=_work, args=(theirs, make), daemon=True)
-                process.start()
-                theirs.close()
-                self._connections.append(ours)
-                self._processes.append(process)
-        except BaseException:
-            self.close()
-            raise
+        names = [f"worker process {n} of {len(makes)} ({each})" for n, each in enumerate(described, 1)]
+        single = [partial(_single_threaded, make) for make in makes]
+        self.pool = ProcessPool(single, names, module=_PRELOADED, timeout_s=timeout_s)
 
     def ask(self, request: Request) -> TensorDictBase:
         """See :class:`Teams`.
@@ -106,78 +83,19 @@ class TeamProcesses:
         Raises:
             WorkerError: if a process dies or hangs.
         """
-        for number, connection in enumerate(self._connections):
-            with self._reporting(number):
-                connection.send(request)
-        answers: dict[int, Driven] = {}
-        heard_s = dict.fromkeys(range(len(self._connections)), time.monotonic())
-        while len(answers) < len(self._connections):
-            interruption_point()
-            missing = {each: n for n, each in enumerate(self._connections) if n not in answers}
-            for connection in cast(list[Connection], wait(list(missing), timeout=_ALIVE_EVERY_S)):
-                number = missing[connection]
-                with self._reporting(number):
-                    answer: Driven | None = connection.recv()
-                heard_s[number] = time.monotonic()
-                if answer is not None:
-                    answers[number] = answer
-            for number in missing.values():
-                if self._timeout_s is not None and time.monotonic() - heard_s[number] > self._timeout_s:
-                    self._hung.add(number)
-                    raise self._error(number)
-        return side_by_side([answers[number] for number in range(len(self._connections))]).tensordict()
-
-    @contextlib.contextmanager
-    def _reporting(self, number: int) -> Iterator[None]:
-        """Say which process failed while one talks to it; kill it if it stops in the middle of that."""
-        timer = None
-        if self._timeout_s is not None:
-            timer = threading.Timer(self._timeout_s, self._kill, (number,))
-            timer.start()
-        try:
-            yield
-        except (EOFError, OSError) as error:
-            self._processes[number].join()
-            raise self._error(number) from error
-        finally:
-            if timer is not None:
-                timer.cancel()
-
-    def _kill(self, number: int) -> None:
-        self._hung.add(number)
-        self._processes[number].kill()
-
-    def _error(self, number: int) -> WorkerError:
-        if number in self._hung:
-            how = f"gave no answer within {self._timeout_s:g} s"
-        else:
-            how = ending(self._processes[number].exitcode)
-        return WorkerError(f"worker process {number + 1} of {len(self._processes)} ({self._described[number]}) {how}")
+        for number in range(len(self.pool)):
+            self.pool.send(number, request)
+        answers: dict[int, Driven] = dict(self.pool.answers(until_done=True))
+        return side_by_side([answers[number] for number in sorted(answers)]).tensordict()
 
     def close(self) -> None:
         """See :class:`Teams`."""
-        # They hold nothing that must be kept; SIGKILL also ends those that are stopped.
-        for process in self._processes:
-            process.kill()
-        for process, connection in zip(self._processes, self._connections, strict=True):
-            process.join()
-            connection.close()
-        self._processes, self._connections = [], []
+        self.pool.close()
 
 
-def _work(connection: Connection, make: MakeDrive) -> None:
-    """Drive what is asked for until nobody asks any more."""
-    # A terminal sends Ctrl-C to all processes; the main one ends the others.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextlib.contextmanager
+def _single_threaded(make: MakeDrive) -> Iterator[Drive]:
+    """Make what drives in a process of its own: a few agents' rows gain nothing from a second thread."""
     torch.set_num_threads(1)
-    told_s = time.monotonic()
-
-    def alive() -> None:
-        nonlocal told_s
-        if time.monotonic() - told_s > _ALIVE_EVERY_S:
-            connection.send(None)
-            told_s = time.monotonic()
-
-    with make() as drive, contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            connection.send(drive(connection.recv(), alive))
+    with make() as drive:
+        yield drive

@@ -109,25 +109,30 @@ def clear_leftovers(folder: Path) -> None:
 class FolderLock:
     """Keeps other processes from training in the same folder, for as long as this process lives or until closed.
 
-    The operating system lets go of it when the process ends, however it ends; the file ``lock`` stays.
+    The operating system lets go of it when the process ends, however it ends; its file stays.
 
     Args:
         folder: must exist.
+        name: of the file in it.
 
     Raises:
         UserInputError: if another process holds it, or it cannot be opened.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, name: str = "lock") -> None:
         try:
-            self._file = (folder / "lock").open("a")
+            self._file = (folder / name).open("a")
         except OSError as error:
-            raise UserInputError(f"{folder / 'lock'} cannot be opened ({error.strerror}): remove it") from error
+            raise UserInputError(f"{folder / name} cannot be opened ({error.strerror}): remove it") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             self._file.close()
-            raise UserInputError(f"{folder} is being trained in by another process: wait for it, or stop it") from error
+            if isinstance(error, BlockingIOError):
+                sentence = f"{folder} is being trained in by another process: wait for it, or stop it"
+            else:
+                sentence = f"{folder / name} cannot be locked ({error.strerror}): choose a folder on another disk"
+            raise UserInputError(sentence) from error
 
     def close(self) -> None:
         """Let others train in the folder."""

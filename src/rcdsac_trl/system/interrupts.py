@@ -2,11 +2,6 @@
 
 Python raises ``KeyboardInterrupt`` wherever it happens to be. Inside a callback of compiled code it is lost, or comes
 out as a ``SystemError``: about one training in ten then ended with a traceback, or did not end.
-
-Public names::
-
-    with at_safe_points(): ...      from here on Ctrl-C is kept
-    interruption_point()            and raised here
 """
 
 import signal

@@ -10,9 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system import cgroups
 
-_MEMINFO = Path("/proc/meminfo")
-_CGROUP = Path("/sys/fs/cgroup")
 _DISK = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -32,6 +31,8 @@ def fault_sentence(error: BaseException) -> str | None:
         >>> fault_sentence(OSError(errno.ENOSPC, "No space left on device", "runs/a/replay"))
         'the disk is full (runs/a/replay: No space left on device)'
     """
+    if isinstance(error, OSError) and (told := _temporary_fault(str(error))) is not None:
+        return told
     if isinstance(error, OSError) and error.errno in _DISK:
         what = f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror)
         return f"{_DISK[error.errno]} ({what})"
@@ -39,6 +40,15 @@ def fault_sentence(error: BaseException) -> str | None:
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(t in text for t in _NO_MEMORY)):
         told = " ".join(str(error).split())
         return "there is not enough memory" + (f" ({told})" if told else "")
+    return None
+
+
+def _temporary_fault(text: str) -> str | None:
+    """Say what is wrong with the folder for temporary files, through whose sockets processes talk to each other."""
+    if "No usable temporary directory" in text:
+        return "there is no folder for temporary files: set TMPDIR to one that can be written"
+    if "AF_UNIX path too long" in text:
+        return f"the folder for temporary files has too long a path ({tempfile.gettempdir()}): set TMPDIR to another"
     return None
 
 
@@ -81,17 +91,21 @@ def check_picture(out: Path) -> None:
         raise UserInputError(f"out={out} is a folder: give a file")
 
 
-def available_memory_bytes() -> int | None:
-    """Return how much memory and swap this process can still take; None where the system does not say (not Linux)."""
+def available_memory_bytes(system: Path = cgroups.SYSTEM) -> int | None:
+    """Return how much memory this process can still take: of the machine's with its swap, and of its container's.
+
+    Args:
+        system: holds ``proc`` and ``sys``.
+
+    Returns:
+        None where the system does not say (not Linux).
+    """
     found = []
     with suppress(OSError, KeyError, ValueError):
-        lines = dict(line.split(":", 1) for line in _MEMINFO.read_text().splitlines())
+        lines = dict(line.split(":", 1) for line in (system / "proc/meminfo").read_text().splitlines())
         found.append(sum(int(lines[key].split()[0]) for key in ("MemAvailable", "SwapFree")) * 1024)
-    with suppress(OSError, KeyError, ValueError):  # "max" where there is no limit
-        used = int((_CGROUP / "memory.current").read_text())
-        # Files that were read count as used, but give way.
-        stat = dict(line.split() for line in (_CGROUP / "memory.stat").read_text().splitlines())
-        found.append(int((_CGROUP / "memory.max").read_text()) - used + int(stat["inactive_file"]))
+    if (room := cgroups.memory_room_bytes(system)) is not None:
+        found.append(room)
     return min(found, default=None)
 
 

@@ -9,7 +9,7 @@ import sys
 from contextlib import suppress
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.system.cores import usable_cores
+from rcdsac_trl.system.cores import allowed_cores, usable_cores
 
 # glibc maps and unmaps every large temporary by default, which costs more than the arithmetic on it.
 _GLIBC_KEEPS_PAGES = {
@@ -35,6 +35,19 @@ def keep_pages() -> None:
         os.execve(sys.executable, sys.orig_argv, os.environ | _GLIBC_KEEPS_PAGES)
 
 
+def bound_threads() -> None:
+    """Keep OpenMP and BLAS from starting more threads than there are cores to use.
+
+    They count the cores they may run on, and see neither a container's quota nor a share. A user's own number stays.
+
+    Raises:
+        UserInputError: if the share is no number.
+    """
+    cores = usable_cores()
+    if cores < allowed_cores():
+        os.environ.setdefault("OMP_NUM_THREADS", str(cores))
+
+
 def _has_glibc() -> bool:
     """Return whether the C library is glibc: no other knows its version's name."""
     try:
@@ -46,6 +59,15 @@ def _has_glibc() -> bool:
 def quiet_libraries() -> None:
     """Keep TorchRL's own notes (every storage it makes) out of the user's log, unless they ask for them."""
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+
+def let_workers_rest() -> None:
+    """Let the workers of a ``ParallelEnv`` wait for days, unless a user says otherwise.
+
+    They would give up after three hours without work, which a learner may well take. TorchRL reads this as it is
+    imported; they end with the process that started them all the same.
+    """
+    os.environ.setdefault("BATCHED_PIPE_TIMEOUT", "1000000")
 
 
 def allocator() -> str:

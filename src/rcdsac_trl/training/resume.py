@@ -8,7 +8,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.config.compose import compose, output_folder
+from rcdsac_trl.config.compose import compose, key_of, output_folder
 from rcdsac_trl.config.run_config import CHECKPOINTS, CONFIG_NAME, settings_of_run
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage.checkpoint_record import newest
@@ -32,7 +32,7 @@ def run_to_continue(overrides: list[str]) -> Path | None:
         UserInputError: for a folder that holds no run, overrides that contradict the run, and runs that cannot be told
             apart from others.
     """
-    if not any(_key(override) == "resume" for override in overrides):
+    if not any(key_of(override) == "resume" for override in overrides):
         return None
     cfg = compose("train", overrides)
     if cfg.resume is None:
@@ -90,7 +90,7 @@ def _check_overrides(folder: Path, overrides: list[str]) -> None:
     """Refuse what would make the run another one; what it was started with, and what changes nothing, may stand."""
     own = _own_overrides(folder)
     for override in overrides:
-        key = _key(override)
+        key = key_of(override)
         if override in own or key == "resume":
             continue
         if key == "hydra.run.dir" and Path(override.partition("=")[2]).resolve() == folder.resolve():
@@ -106,18 +106,14 @@ def _own_overrides(folder: Path) -> list[str]:
     """Read the overrides of the call that started a run; none if they cannot be read any more."""
     try:
         noted = json.loads((folder / MANIFEST_NAME).read_bytes())["overrides"]
-        return [override for override in noted if _key(override) != "resume"]
+        return [override for override in noted if key_of(override) != "resume"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return []
 
 
 def _changes(own: list[str], override: str) -> bool:
-    others = [other for other in own if _key(other) != _key(override)]
+    others = [other for other in own if key_of(other) != key_of(override)]
     return _comparable(compose("train", own)) != _comparable(compose("train", [*others, override]))
-
-
-def _key(override: str) -> str:
-    return override.lstrip("+~").partition("=")[0]
 
 
 def _config(folder: Path) -> dict[str, Any] | None:

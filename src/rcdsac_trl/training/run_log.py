@@ -140,8 +140,11 @@ class RunLog:
 
     def episodes(self, name: str, rows: pd.DataFrame) -> None:
         """Append one row an episode to ``<name>_episodes.csv``."""
-        path = self.folder / f"{name}_episodes.csv"
-        rows.to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.6g")
+        with (self.folder / f"{name}_episodes.csv").open("ab") as file:
+            is_new = file.tell() == 0
+            written = rows.to_csv(header=is_new, index=False, float_format="%.6g").encode()
+            # At once, so that whoever reads meanwhile finds all of them or none.
+            file.write(written)
 
     def lengths(self) -> dict[str, int]:
         """Bring everything to the disk; see :func:`lengths`."""

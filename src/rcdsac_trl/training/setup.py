@@ -30,8 +30,9 @@ from rcdsac_trl.system.processes import resolve_processes_beside
 from rcdsac_trl.training import run_log
 from rcdsac_trl.training.learner import Learner
 from rcdsac_trl.training.nan_guard import FiniteGuard, load_failure
-from rcdsac_trl.training.trainer import Trainer
-from rcdsac_trl.training.validation import Snapshot, Validation
+from rcdsac_trl.training.restart_budget import RestartBudget
+from rcdsac_trl.training.trainer import IterationHook, Trainer, saved_sentence
+from rcdsac_trl.training.validation import Snapshot, SnapshotEvaluator, Validation
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 
 # Validation looks at the same maps whatever seed a run is trained with.
@@ -49,13 +50,18 @@ def given_overrides() -> list[str]:
     return list(HydraConfig.get().overrides.task)
 
 
-def check_training(cfg: DictConfig) -> None:
-    """Read everything, so that what cannot work is refused before anything is written."""
+def check_training(cfg: DictConfig) -> TrainingSettings:
+    """Read everything, so that what cannot work is refused before anything is written.
+
+    Raises:
+        UserInputError: for whatever cannot work, or not on this machine.
+    """
     settings = training_settings(cfg)
     runtime.resolve_device(settings.device)
     run_log.check_backends(settings.logger.backends)
     check_collector(settings)
     _check_memory(settings)
+    return settings
 
 
 def _check_memory(settings: TrainingSettings) -> None:
@@ -108,18 +114,25 @@ def make_learner(settings: TrainingSettings, device: str) -> Learner:
     )
 
 
-def make_trainer(cfg: DictConfig, folder: Path, overrides: Sequence[str] = ()) -> Trainer:
+def make_trainer(
+    cfg: DictConfig,
+    folder: Path,
+    overrides: Sequence[str] = (),
+    *,
+    on_iteration_end: IterationHook | None = None,
+) -> Trainer:
     """Make a new training run that writes into a folder.
 
     Args:
         cfg: of the run.
         folder: made if it is not there.
         overrides: that made the config; noted for whoever continues the run.
+        on_iteration_end: called after every iteration with the trainer and the iteration's scalars.
 
     Raises:
-        UserInputError: if another process trains in the folder, or it holds a run.
+        UserInputError: as :func:`check_training`, or if another process trains in the folder, or it holds a run.
     """
-    settings = training_settings(cfg)
+    settings = check_training(cfg)
     facts = {
         "overrides": list(overrides),
         "device": runtime.resolve_device(settings.device),
@@ -133,13 +146,13 @@ def make_trainer(cfg: DictConfig, folder: Path, overrides: Sequence[str] = ()) -
     lock = FolderLock(folder)
     try:
         run_log.start_run_folder(folder, cfg, facts)
-        return _assemble(settings, learner, folder, lock, None, [])
+        return _assemble(settings, learner, folder, lock, None, [], on_iteration_end)
     except BaseException:
         lock.close()
         raise
 
 
-def resume_training(folder: Path) -> Trainer | None:
+def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = None) -> Trainer | None:
     """Make the trainer that continues a run in its folder, as its config says; None if the run is finished.
 
     Raises:
@@ -157,7 +170,7 @@ def resume_training(folder: Path) -> Trainer | None:
                 rotate(folder / CHECKPOINTS, keep=settings.checkpoint.keep, replay=folder / REPLAY)
             lock.close()
             return None
-        return _assemble(settings, _learner_here(settings), folder, lock, saved, damaged)
+        return _assemble(settings, _learner_here(settings), folder, lock, saved, damaged, on_iteration_end)
     except BaseException:
         lock.close()
         raise
@@ -187,7 +200,13 @@ def _learner_here(settings: TrainingSettings) -> Learner:
 
 
 def _assemble(
-    settings: TrainingSettings, learner: Learner, folder: Path, lock: FolderLock, saved: Saved | None, told: list[str]
+    settings: TrainingSettings,
+    learner: Learner,
+    folder: Path,
+    lock: FolderLock,
+    saved: Saved | None,
+    messages: list[str],
+    on_iteration_end: IterationHook | None,
 ) -> Trainer:
     device, threads = runtime.resolve_device(settings.device), runtime.resolve_threads(settings.threads)
     loss, average, optimizer, relabel = learner.loss, learner.average, learner.optimizer, learner.relabel
@@ -205,48 +224,60 @@ def _assemble(
     # has its state.
     checkpoints_bytes = 2 * checkpoints.size_bytes() * (settings.checkpoint.keep + 3)
     shortage = resources.disk_shortage(folder, max(0, _replay_bytes(settings) - written) + checkpoints_bytes)
-    told = [*told, *([] if shortage is None else [shortage])]
+    messages = [*messages, *([] if shortage is None else [shortage])]
     progress, pending = Progress(), None
     if saved is not None:
         progress, more = _restore(folder, checkpoints, saved)
         pending, progress, left_out = _pending(settings, checkpoints.folder, progress)
         total = settings.schedule.iterations
-        told = [
-            *told,
+        messages = [
+            *messages,
             *more,
             *left_out,
             f"continue after {progress.iterations} of {total} iterations, from {saved.path}",
         ]
     log = run_log.RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
     active = f"allocator: {runtime.allocator()}, matrix products by {matmul.LIBRARY} BLAS"
-    for sentence in [*told, f"device {device}, {threads} threads, {active}"]:
+    for sentence in [*messages, f"device {device}, {threads} threads, {active}"]:
         log.message(sentence)
+    restarts = RestartBudget(
+        settings.world.max_restarts,
+        progress.restarts,
+        message=log.message,
+        saved=partial(saved_sentence, checkpoints, log),
+    )
     return Trainer(
         schedule=settings.schedule,
         progress=progress,
         episodes=make_episodes(settings, loss.actor_network, device, progress),
         learner=learner,
         guard=FiniteGuard(folder, loss, optimizer),
-        validate=_validation(settings, device, threads),
-        validate_every=settings.validation.every_iterations,
-        pending=pending,
+        validation=Validation(
+            _snapshot_evaluator(settings, device, threads),
+            iterations=settings.schedule.iterations,
+            every_iterations=settings.validation.every_iterations,
+            restarts=restarts,
+            log=log,
+            pending=pending,
+        ),
         checkpoints=checkpoints,
         checkpoint_every=settings.checkpoint.every_iterations,
+        restarts=restarts,
         log=log,
         lock=lock,
-        max_restarts=settings.world.max_restarts,
         context_key=settings.algo.context_key,
+        on_iteration_end=on_iteration_end,
     )
 
 
 def _restore(folder: Path, checkpoints: Checkpoints, saved: Saved) -> tuple[Progress, list[str]]:
     """Bring components and logs back to a checkpoint; return the progress, and what the user should know."""
     checkpoints.restore(saved)
-    told = run_log.cut(folder, saved.logs)
+    messages = run_log.cut(folder, saved.logs)
     damage = best_damage(checkpoints.folder, saved.progress)
     if damage is None:
-        return saved.progress, told
-    return replace(saved.progress, best_score=None, best_iterations=None), [*told, damage]
+        return saved.progress, messages
+    return replace(saved.progress, best_score=None, best_iterations=None), [*messages, damage]
 
 
 def _pending(
@@ -260,12 +291,12 @@ def _pending(
     try:
         then = load_average(path, average).progress
     except DamagedError as error:
-        told = f"checkpoint {path} is damaged: {error}; its validation was under way and is left out"
-        return None, replace(progress, validating_iterations=None), [told]
+        message = f"checkpoint {path} is damaged: {error}; its validation was under way and is left out"
+        return None, replace(progress, validating_iterations=None), [message]
     return Snapshot(then, packed(average.module)), progress, []
 
 
-def _validation(settings: TrainingSettings, device: str, threads: int) -> Validation:
+def _snapshot_evaluator(settings: TrainingSettings, device: str, threads: int) -> SnapshotEvaluator:
     world, given = replace(settings.training_world, num_workers=0), settings.validation
     course = Course(
         trained=settings,
@@ -280,7 +311,7 @@ def _validation(settings: TrainingSettings, device: str, threads: int) -> Valida
     )
     beside = resolve_processes_beside(given.processes, given.num_maps, threads)
     alone = min(usable_cores(), given.num_maps) if given.processes == "auto" else beside
-    return Validation(
+    return SnapshotEvaluator(
         partial(driver, course),
         num_maps=given.num_maps,
         steps=world.task.episode_steps,

@@ -1,10 +1,15 @@
-"""Validation of a snapshot of the agent, beside the training that goes on meanwhile."""
+"""Validation: when the agent is measured, by which processes, and what is made of the result.
+
+:class:`SnapshotEvaluator` measures one snapshot beside the training that goes on meanwhile; :class:`Validation` knows
+when that is due and takes the results in.
+"""
 
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeVar
 
 import pandas as pd
 
@@ -13,6 +18,10 @@ from rcdsac_trl.rollout.measurement import table_of
 from rcdsac_trl.rollout.metrics import METRICS, validation_score
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.processes import WorkerError
+from rcdsac_trl.training.restart_budget import RestartBudget
+from rcdsac_trl.training.run_log import RunLog
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -28,7 +37,7 @@ class Snapshot:
     actor: bytes
 
 
-class Validation:
+class SnapshotEvaluator:
     """Measures one snapshot after another, each on the same maps.
 
     What is found follows from the snapshot alone, however many processes drive and whenever they do.
@@ -96,7 +105,7 @@ class Validation:
         self._drivers = Drivers(make, self._num_maps, processes, timeout_s=self._timeout_s, at_once=True)
         return self._drivers
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Take what is measured so far, without waiting.
 
         Raises:
@@ -135,11 +144,103 @@ class Validation:
         self._drivers = None
 
 
+class Validation:
+    """Measures the averaged actor every so many iterations and after the last one, and says which was the best.
+
+    A result is taken in when the next validation is due. So nothing that is learnt or logged depends on when it was
+    found: a run ends the same with any number of processes.
+
+    Args:
+        evaluator: measures snapshots.
+        iterations: of the run.
+        every_iterations: iterations between two validations.
+        restarts: counts the faults of its processes; a validation begins anew after one, on the same maps.
+        log: where results are written.
+        pending: the snapshot whose validation was under way when the run was left; None: there was none.
+    """
+
+    def __init__(
+        self,
+        evaluator: SnapshotEvaluator,
+        *,
+        iterations: int,
+        every_iterations: int,
+        restarts: RestartBudget,
+        log: RunLog,
+        pending: Snapshot | None = None,
+    ) -> None:
+        self.evaluator = evaluator
+        self.iterations = iterations
+        self.every_iterations = every_iterations
+        self._restarts = restarts
+        self._log = log
+        self._pending = pending
+
+    def go_on(self, progress: Progress) -> Progress:
+        """Begin the validation again that was under way when the run was left."""
+        return progress if self._pending is None else self._begin(self._pending, progress)
+
+    def after_iteration(self, progress: Progress, actor: Callable[[], bytes]) -> Progress:
+        """Where validation is due, take in what the one before has found, and begin it beside what follows.
+
+        Args:
+            progress: of the run.
+            actor: packs the averaged actor as it is now.
+
+        Returns:
+            The progress, with what is known of the best agent and of the validation that is under way.
+
+        Raises:
+            TrainingError: if its processes fail too often.
+        """
+        if progress.iterations != self.iterations and progress.iterations % self.every_iterations:
+            self._surviving(self.evaluator.poll)
+            return progress
+        progress = self._take_in(progress)
+        return self._begin(Snapshot(progress, actor()), progress)
+
+    def _begin(self, snapshot: Snapshot, progress: Progress) -> Progress:
+        at_end = progress.iterations == self.iterations
+        progress = replace(progress, validating_iterations=snapshot.progress.iterations)
+        self._surviving(lambda: self.evaluator.start(snapshot, alone=at_end))
+        return self._take_in(progress) if at_end or not self.evaluator.beside else progress
+
+    def _take_in(self, progress: Progress) -> Progress:
+        """Wait for the validation that is under way, if one is, and log it as of the agent it has looked at."""
+        if (snapshot := self.evaluator.snapshot) is None:
+            return progress
+        rows = self._surviving(self.evaluator.finish)
+        then = snapshot.progress
+        rows.insert(0, "iteration", then.iterations - 1)
+        rows.insert(1, "updates", then.updates)
+        self._log.episodes("validation", rows)
+        means, scalars = scores(rows, self.evaluator.steps)
+        self._log.validation(then.iterations, means)
+        self._log.scalars(scalars, then.steps)
+        score, best = scalars["validation/score"], progress.best_score
+        if best is None or score > best:
+            progress = replace(progress, best_score=score, best_iterations=then.iterations)
+        return replace(progress, validating_iterations=None)
+
+    def _surviving(self, call: Callable[[], T]) -> T:
+        while True:
+            try:
+                return call()
+            except WorkerError as error:
+                assert self.evaluator.snapshot is not None  # nothing else has processes
+                done = self.evaluator.snapshot.progress.iterations
+                self._restarts.spend(f"validation after {done} iterations", error)
+
+    def close(self) -> None:
+        """End its processes."""
+        self.evaluator.close()
+
+
 def scores(rows: pd.DataFrame, steps: int) -> tuple[pd.DataFrame, dict[str, float]]:
     """Sum a validation up.
 
     Args:
-        rows: one row an episode, from :meth:`Validation.finish`.
+        rows: one row an episode, from :meth:`SnapshotEvaluator.finish`.
         steps: length of an episode.
 
     Returns:

@@ -4,18 +4,11 @@ A step of ten agents takes some forty calls of torch, each of which costs more t
 through all layers in one pass that multiplies only what is not zero: bins that nothing is seen in, which with the
 narrow sensor are most, and what a rectifier has set to zero. An agent's numbers are computed from its own row alone,
 in an order that follows from it, so they do not depend, to the last bit, on how many others there are.
-
-Public names::
-
-    CompiledActor(actor)
-        .step(range [N,180], vectors ([N,k], ..), risk [N,1] | None, is_init [N,1], state [N,128], noise [N,A] | None)
-            -> loc [N,A], scale [N,A], action [N,A], state [N,128]
 """
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,6 +16,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from rcdsac_trl.agent.networks import LOG_STD_RANGE, ActorHead, Encoder
+from rcdsac_trl.system.jit import njit
 
 Floats = NDArray[np.float32]
 
@@ -30,7 +24,7 @@ _LOG_STD_LOW, _LOG_STD_HIGH = (np.float32(limit) for limit in LOG_STD_RANGE)
 # As TorchRL's TanhNormal: an action at the very limit has no finite inverse.
 _LARGEST_ACTION = np.float32(1.0 - torch.finfo(torch.float32).resolution)
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @_compiled
@@ -70,28 +64,28 @@ def _layer(inputs: Floats, weights: Floats, bias: Floats, out: Floats) -> None:
 
 @_compiled
 def _range_features(bins: Floats, weights: "Weights", out: Floats) -> None:
-    """Write the features of one observation: both convolutions and the linear layer."""
+    """Write the features of one observation, its bins padded: both convolutions and the linear layer."""
     taps, channels = weights.conv_1.shape
     positions = weights.linear.shape[0]
     first = np.empty((2 * positions + 1, channels), np.float32)
-    heard = np.zeros(2 * positions + 1, np.bool_)
+    active = np.zeros(2 * positions + 1, np.bool_)
     for p in range(2 * positions + 1):
         window = bins[2 * p : 2 * p + taps]
         for t in range(taps):
-            heard[p] |= window[t] != 0
-        if heard[p]:
+            active[p] |= window[t] != 0
+        if active[p]:
             _layer(window, weights.conv_1, weights.conv_1_bias, first[p])
         else:
-            first[p] = weights.silent_1
+            first[p] = weights.inactive_1
     second = np.empty(channels, np.float32)
     out[:] = weights.linear_bias
     for p in range(positions):
-        if heard[2 * p] or heard[2 * p + 1] or heard[2 * p + 2]:
+        if active[2 * p] or active[2 * p + 1] or active[2 * p + 2]:
             windows = first[2 * p : 2 * p + 3].reshape(3 * channels)
             _layer(windows, weights.conv_2, weights.conv_2_bias, second)
             _add_product(second, weights.linear[p], out)
         else:
-            out += weights.silent_3[p]
+            out += weights.inactive_3[p]
     _rectify(out)
 
 
@@ -111,18 +105,9 @@ def _recurrence(features: Floats, state: Floats, weights: "Weights") -> None:
 
 
 @_compiled
-def _act(
-    ranges: Floats,
-    vectors: Floats,
-    embedded: Floats,
-    states: Floats,
-    noise: Floats,
-    weights: "Weights",
-    loc: Floats,
-    scale: Floats,
-    action: Floats,
-) -> None:
-    """Do a step of every agent: advance ``states`` in place and write loc, scale and action."""
+def _act(agents: "Agents", weights: "Weights") -> None:
+    """Do a step of every agent."""
+    ranges, vectors, embedded, states, noise, loc, scale, action = agents
     num_range = weights.linear_bias.size
     features = np.empty(num_range + weights.vectors_bias.size, np.float32)
     size = weights.head_bias.size
@@ -150,6 +135,19 @@ def _act(
             action[agent, a] = min(max(drawn, -_LARGEST_ACTION), _LARGEST_ACTION)
 
 
+class Agents(NamedTuple):
+    """A step of some agents: what :func:`_act` reads of each, and what it writes."""
+
+    ranges: Floats  # padded, [N, bins]
+    vectors: Floats  # one behind the other, [N, k]
+    embedded: Floats  # beta, [N]
+    states: Floats  # advanced in place, [N, memory]
+    noise: Floats  # [N, action]
+    loc: Floats  # written, [N, action], as the other two
+    scale: Floats
+    action: Floats
+
+
 class Weights(NamedTuple):
     """What :func:`_act` multiplies with: every matrix as [inputs, outputs]."""
 
@@ -159,8 +157,8 @@ class Weights(NamedTuple):
     conv_2_bias: Floats
     linear: Floats  # [positions, channels, features]
     linear_bias: Floats
-    silent_1: Floats  # what the first convolution gives where all is silent, [channels]
-    silent_3: Floats  # what a position that sees only such gives to the linear layer, [positions, features]
+    inactive_1: Floats  # what the first convolution gives where all is inactive, [channels]
+    inactive_3: Floats  # what a position that sees only such gives to the linear layer, [positions, features]
     vectors: Floats  # the layers of all vector observations, one below and beside the other
     vectors_bias: Floats
     input: Floats
@@ -182,8 +180,8 @@ def _copied(encoder: Any, head: Any) -> Weights:
     """Lay out the weights of an actor."""
     conv_1, conv_2, linear = encoder.range.conv_1, encoder.range.conv_2, encoder.range.linear
     channels = conv_2.out_channels
-    silent_1 = conv_1.bias.relu()
-    silent_2 = (conv_2.bias + conv_2.weight.sum(-1) @ silent_1).relu()
+    inactive_1 = conv_1.bias.relu()
+    inactive_2 = (conv_2.bias + conv_2.weight.sum(-1) @ inactive_1).relu()
     by_position = linear.weight.view(linear.out_features, -1, channels).permute(1, 2, 0)
     gru = encoder.gru
     gated = head.measure is not None
@@ -195,8 +193,8 @@ def _copied(encoder: Any, head: Any) -> Weights:
         "conv_2_bias": conv_2.bias,
         "linear": by_position,
         "linear_bias": linear.bias,
-        "silent_1": silent_1,
-        "silent_3": silent_2 @ by_position,
+        "inactive_1": inactive_1,
+        "inactive_3": inactive_2 @ by_position,
         "vectors": torch.block_diag(*[layer.weight.t() for layer in encoder.vectors]),
         "vectors_bias": torch.cat([layer.bias for layer in encoder.vectors]),
         "input": gru.weight_ih_l0.t(),
@@ -271,17 +269,15 @@ class CompiledActor:
         following = torch.where(is_init, 0.0, state)
         size = self._head.output.out_features // 2
         loc, scale, action = range_.new_empty(3, number, size).unbind()
-        _act(
-            range_.contiguous().numpy(),
-            torch.cat(list(vectors), dim=-1).numpy(),
-            embedded.view(-1).numpy(),
-            following.numpy(),
-            (range_.new_zeros(number, size) if noise is None else noise).numpy(),
-            self._current(bool(is_init.any())),
-            loc.numpy(),
-            scale.numpy(),
-            action.numpy(),
+        tensors = (
+            self._encoder.range.padded(range_).contiguous(),
+            torch.cat(list(vectors), dim=-1),
+            embedded.view(-1),
+            following,
+            range_.new_zeros(number, size) if noise is None else noise,
+            *(loc, scale, action),
         )
+        _act(Agents(*(value.numpy() for value in tensors)), self._current(bool(is_init.any())))
         return loc, scale, action, following
 
     def _current(self, begins: bool) -> Weights:

@@ -1,34 +1,55 @@
 """The compiled passes of :mod:`rcdsac_trl.agent.kernels.observation_features`, on arrays.
 
 A batch goes through the range observation's layers, matrix products included, in blocks that stay in the cache. Bins
-that are silent in the whole batch, such as those a narrow sensor lacks, are left out. ``convolutions`` are weight and
-bias of the first and of the second.
+that are inactive in the whole batch, such as those a narrow sensor lacks, are left out.
 """
 
-import numba
+from typing import NamedTuple
+
 import numpy as np
 
-from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.agent.kernels.matmul import empty_aligned, matmul, matmul_nt, matmul_tn
+from rcdsac_trl.system.jit import njit
 
 #: Windows of the second convolution that go through the layers together: their inputs and activations take some 2 MB.
 ROWS_PER_BLOCK = 96 * 43
 # Positions of the first convolution that one of the second sees, its kernel's size; both have stride 2.
 _SEEN = 3
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"contract"})
+
+
+class RangeLayers(NamedTuple):
+    """Weights and biases of the layers, or their gradients."""
+
+    conv_1: np.ndarray  # [channels, 1, taps]
+    conv_1_bias: np.ndarray
+    conv_2: np.ndarray  # [channels, channels, taps]
+    conv_2_bias: np.ndarray
+    linear: np.ndarray  # [features, position, channel]
+    linear_bias: np.ndarray
+
+
+class RangeActivations(NamedTuple):
+    """What the layers write on their way forth and read on their way back."""
+
+    positions: np.ndarray  # the active ones of the second convolution
+    active: np.ndarray  # the linear layer's weight at these, [features, position, channel]
+    inactive: np.ndarray  # its sum over the others, [features, channel]
+    outputs: np.ndarray  # of the second convolution, [observation and active position, channel]
 
 
 @_compiled
-def heard_positions(bins: np.ndarray, taps: int) -> np.ndarray:
+def active_positions(bins: np.ndarray, taps: int) -> np.ndarray:
     """Return the positions of the second convolution that see a bin which is not 0 in all the batch, or the first."""
-    sounds = np.zeros(bins.shape[1], np.uint8)
+    seen = np.zeros(bins.shape[1], np.uint8)
     for o in range(bins.shape[0]):
         row = bins[o]
         for i in range(row.size):
-            sounds[i] |= row[i] != 0
+            seen[i] |= row[i] != 0
     last = ((bins.shape[1] - taps) // 2 + 1 - _SEEN) // 2
     span = 2 * (_SEEN - 1) + taps
-    return np.array([p for p in range(last + 1) if p == 0 or sounds[4 * p : 4 * p + span].any()], np.int64)
+    return np.array([p for p in range(last + 1) if p == 0 or seen[4 * p : 4 * p + span].any()], np.int64)
 
 
 @_compiled
@@ -78,16 +99,16 @@ def _first_layer_gradient(
 
 
 @_compiled
-def _divide(by_position: np.ndarray, positions: np.ndarray, heard: np.ndarray, silent: np.ndarray) -> None:
-    """Copy the linear layer's weight ``[features, position, channel]`` where heard, and add it up where silent."""
+def _divide(by_position: np.ndarray, positions: np.ndarray, active: np.ndarray, inactive: np.ndarray) -> None:
+    """Copy the linear layer's weight ``[features, position, channel]`` where active, and add it up where inactive."""
     for f in range(by_position.shape[0]):
-        total, number = silent[f], 0
+        total, number = inactive[f], 0
         for c in range(total.size):
             total[c] = 0
         for p in range(by_position.shape[1]):
             row = by_position[f, p]
             if number < positions.size and positions[number] == p:
-                out = heard[f, number]
+                out = active[f, number]
                 for c in range(row.size):
                     out[c] = row[c]
                 number += 1
@@ -98,15 +119,15 @@ def _divide(by_position: np.ndarray, positions: np.ndarray, heard: np.ndarray, s
 
 @_compiled
 def _unite(
-    d_by_position: np.ndarray, positions: np.ndarray, d_heard: np.ndarray, d_bias: np.ndarray, value: np.ndarray
+    d_by_position: np.ndarray, positions: np.ndarray, d_active: np.ndarray, d_bias: np.ndarray, value: np.ndarray
 ) -> None:
-    """Write the gradient of the linear layer's weight: silent positions all have the same activation."""
+    """Write the gradient of the linear layer's weight: inactive positions all have the same activation."""
     for f in range(d_by_position.shape[0]):
         number = 0
         for p in range(d_by_position.shape[1]):
             row = d_by_position[f, p]
             if number < positions.size and positions[number] == p:
-                out = d_heard[f, number]
+                out = d_active[f, number]
                 for c in range(row.size):
                     row[c] = out[c]
                 number += 1
@@ -116,8 +137,8 @@ def _unite(
 
 
 @_compiled
-def _silent_activations(w2: np.ndarray, b1: np.ndarray, b2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both convolutions' activations where they see silent bins alone."""
+def _inactive_activations(w2: np.ndarray, b1: np.ndarray, b2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return both convolutions' activations where they see inactive bins alone."""
     first, second = np.maximum(b1, b1.dtype.type(0)), b2.copy()
     for o in range(second.size):
         for i in range(first.size):
@@ -133,7 +154,7 @@ def _by_tap(w1: np.ndarray, w2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for c in range(w1.shape[0]):
         for k in range(w1.shape[2]):
             taps[k, c] = w1[c, 0, k]
-    kernel = room((_SEEN * channels, w2.shape[0]), w2)
+    kernel = empty_aligned((_SEEN * channels, w2.shape[0]), w2)
     for o in range(w2.shape[0]):
         for i in range(channels):
             for s in range(_SEEN):
@@ -142,40 +163,31 @@ def _by_tap(w1: np.ndarray, w2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @_compiled
-def range_layers(
-    bins: np.ndarray,
-    positions: np.ndarray,
-    convolutions: tuple[np.ndarray, ...],
-    by_position: np.ndarray,
-    b3: np.ndarray,
-    heard: np.ndarray,
-    silent: np.ndarray,
-    activations: np.ndarray,
-    out: np.ndarray,
-) -> None:
-    """Write the features into out's first columns, and what the way back reads of heard and silent positions."""
-    w1, b1, w2, b2 = convolutions
+def range_layers(bins: np.ndarray, weights: RangeLayers, activations: RangeActivations, out: np.ndarray) -> None:
+    """Write the features into out's first columns, and what the way back reads of active and inactive positions."""
+    w1, b1, w2, b2, by_position, b3 = weights
+    positions, active, inactive, outputs = activations
     number, features = positions.size, b3.size
     taps, kernel = _by_tap(w1, w2)
-    _divide(by_position, positions, heard, silent)
-    _, quiet = _silent_activations(w2, b1, b2)
-    offset = b3 + (silent * quiet).sum(1)
+    _divide(by_position, positions, active, inactive)
+    _, inactive_output = _inactive_activations(w2, b1, b2)
+    offset = b3 + (inactive * inactive_output).sum(1)
     size = _block(bins.shape[0], number)
-    windows = room((size * number, kernel.shape[0]), bins)
+    windows = empty_aligned((size * number, kernel.shape[0]), bins)
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
-        window, rows = windows[: (stop - start) * number], activations[start * number : stop * number]
+        window, rows = windows[: (stop - start) * number], outputs[start * number : stop * number]
         _first_layer(bins[start:stop], positions, taps, b1, window)
-        times(window, kernel, rows, False)
+        matmul(window, kernel, rows, False)
         _rectify(rows, 0, b2)
-        times_transposed(rows.reshape(stop - start, -1), _flat(heard), out[start:stop, :features], False)
+        matmul_nt(rows.reshape(stop - start, -1), _flat(active), out[start:stop, :features], False)
     _rectify(out, 0, offset)
 
 
 @_compiled
 def linear(vector: np.ndarray, weight: np.ndarray, bias: np.ndarray, first: int, out: np.ndarray) -> None:
     """Write a rectified linear layer into out's columns from the first on."""
-    times_transposed(vector, weight, out[:, first : first + bias.size], False)
+    matmul_nt(vector, weight, out[:, first : first + bias.size], False)
     _rectify(out, first, bias)
 
 
@@ -193,7 +205,7 @@ def _rectify(out: np.ndarray, first: int, bias: np.ndarray) -> None:
 def where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> np.ndarray:
     """Return the gradient where out is active, and write its sums."""
     zero = out.dtype.type(0)
-    result = room(out.shape, out)
+    result = empty_aligned(out.shape, out)
     d_bias[:] = zero
     for r in range(out.shape[0]):
         row, slopes, values = result[r], gradient[r], out[r]
@@ -207,47 +219,51 @@ def where_active(gradient: np.ndarray, out: np.ndarray, d_bias: np.ndarray) -> n
 def range_gradient(
     gradient: np.ndarray,
     bins: np.ndarray,
-    positions: np.ndarray,
-    convolutions: tuple[np.ndarray, ...],
-    heard: np.ndarray,
-    silent: np.ndarray,
-    activations: np.ndarray,
-    d_convolutions: tuple[np.ndarray, ...],
-    d_by_position: np.ndarray,
-    d_b3: np.ndarray,
+    weights: RangeLayers,
+    activations: RangeActivations,
+    gradients: RangeLayers,
 ) -> None:
-    """Write the gradients of all layers from that of the linear layer's output, ``gradient``; that of b3 is given."""
-    (w1, b1, w2, b2), (d_w1, d_b1, d_w2, d_b2) = convolutions, d_convolutions
+    """Write the gradients of all layers from that of the linear layer before its rectifier, ``[n, features ..]``.
+
+    That of the linear layer's bias is given.
+    """
+    w1, b1, w2, b2, _, _ = weights
+    positions, active, inactive, outputs = activations
+    d_w1, d_b1, d_w2, d_b2, d_by_position, d_b3 = gradients
     number, zero, channels = positions.size, bins.dtype.type(0), b1.size
     taps, kernel = _by_tap(w1, w2)
-    d_taps, d_kernel, d_heard = np.zeros_like(taps), room(kernel.shape, bins), room(heard.shape, bins)
-    d_kernel[:], d_heard[:] = zero, zero
+    d_taps, d_kernel, d_active = (
+        np.zeros_like(taps),
+        empty_aligned(kernel.shape, bins),
+        empty_aligned(active.shape, bins),
+    )
+    d_kernel[:], d_active[:] = zero, zero
     d_b1[:], d_b2[:] = zero, zero
     size = _block(bins.shape[0], number)
-    windows = room((size * number, kernel.shape[0]), bins)
-    d_windows, d_activations = room(windows.shape, bins), room((size * number, channels), bins)
+    windows = empty_aligned((size * number, kernel.shape[0]), bins)
+    d_windows, d_activations = empty_aligned(windows.shape, bins), empty_aligned((size * number, channels), bins)
     for start in range(0, bins.shape[0], size):
         stop = min(start + size, bins.shape[0])
         window, d_window = windows[: (stop - start) * number], d_windows[: (stop - start) * number]
-        rows, d_rows = activations[start * number : stop * number], d_activations[: (stop - start) * number]
+        rows, d_rows = outputs[start * number : stop * number], d_activations[: (stop - start) * number]
         slopes = gradient[start:stop, : d_b3.size]
-        transposed_times(slopes, rows.reshape(stop - start, -1), _flat(d_heard), True)
-        times(slopes, _flat(heard), d_rows.reshape(stop - start, -1), False)
+        matmul_tn(slopes, rows.reshape(stop - start, -1), _flat(d_active), True)
+        matmul(slopes, _flat(active), d_rows.reshape(stop - start, -1), False)
         for r in range(rows.shape[0]):
             row, d_row = rows[r], d_rows[r]
             for c in range(row.size):
                 d_row[c] = d_row[c] if row[c] > zero else zero
                 d_b2[c] += d_row[c]
         _first_layer(bins[start:stop], positions, taps, b1, window)
-        transposed_times(window, d_rows, d_kernel, True)
-        times_transposed(d_rows, kernel, d_window, False)
+        matmul_tn(window, d_rows, d_kernel, True)
+        matmul_nt(d_rows, kernel, d_window, False)
         _first_layer_gradient(bins[start:stop], positions, window, d_window, d_taps, d_b1)
-    # What the silent positions add to the linear layer's bias, backwards.
-    first, second = _silent_activations(w2, b1, b2)
+    # What the inactive positions add to the linear layer's bias, backwards.
+    first, second = _inactive_activations(w2, b1, b2)
     d_second = np.zeros_like(second)
     for f in range(d_b3.size):
         for o in range(channels):
-            d_second[o] += d_b3[f] * silent[f, o]
+            d_second[o] += d_b3[f] * inactive[f, o]
     for o in range(channels):
         d_second[o] = d_second[o] if second[o] > zero else zero
         d_b2[o] += d_second[o]
@@ -259,13 +275,13 @@ def range_gradient(
     for c in range(channels):
         for k in range(taps.shape[0]):
             d_w1[c, 0, k] = d_taps[k, c]
-    _unite(d_by_position, positions, d_heard, d_b3, second)
+    _unite(d_by_position, positions, d_active, d_b3, second)
 
 
 @_compiled
-def _flat(heard: np.ndarray) -> np.ndarray:
+def _flat(active: np.ndarray) -> np.ndarray:
     """Return ``[features, position, channel]`` as a matrix."""
-    return heard.reshape(heard.shape[0], heard.shape[1] * heard.shape[2])
+    return active.reshape(active.shape[0], active.shape[1] * active.shape[2])
 
 
 @_compiled

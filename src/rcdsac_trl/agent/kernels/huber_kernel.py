@@ -1,21 +1,17 @@
-"""The quantile Huber loss on a CPU, in one compiled pass that makes no table of pairs.
-
-Public names::
-
-    quantile_huber(quantiles [..,N], targets [..,N'], tau [..,N], kappa) -> [..]
-"""
+"""The quantile Huber loss on a CPU, in one compiled pass that makes no table of pairs."""
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from rcdsac_trl.system.jit import njit
+
 
 # A sum may be added up in any order, which lets several of its terms be added at once.
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
+@njit(nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
 def _huber(
     quantiles: np.ndarray, targets: np.ndarray, tau: np.ndarray, kappa: float, errors: np.ndarray, slopes: np.ndarray
 ) -> None:

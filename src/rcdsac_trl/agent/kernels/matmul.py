@@ -3,15 +3,6 @@
 A call of ``torch.mm`` and the slices around it take as long as the product of a hundred rows, and come back to Python
 between any two. Numba's own ``@`` calls SciPy's BLAS, which is a quarter slower than the MKL that torch has on x86, and
 whose threads torch knows nothing of.
-
-Public names::
-
-    find(routine, in_torch), bind(routine, address)             where a routine is, and who is called
-    LIBRARY                     which BLAS it is: "torch's" or, where torch's cannot be called, "SciPy's"
-    times(a [m,k], b [k,n], out [m,n], add)                     out = a @ b; compiled, as are the other two
-    times_transposed(a [m,k], b [n,k], out [m,n], add)          out = a @ b.T
-    transposed_times(a [k,m], b [k,n], out [m,n], add)          out = a.T @ b
-    room(shape, like) -> array                                  for matrices that compiled passes make
 """
 
 import ctypes
@@ -20,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.binding
-import numba
 import numpy as np
 import torch
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import get_cython_function_address, intrinsic
+
+from rcdsac_trl.system.jit import njit
 
 #: BLAS's names of the product of two matrices, by their type.
 ROUTINES = {types.float32: "sgemm", types.float64: "dgemm"}
@@ -63,7 +55,7 @@ def _bind_all() -> str:
 LIBRARY = _bind_all()
 # Bytes, a multiple of which the places of torch's tensors are, too; numba's own arrays begin at half of that.
 _ALIGNMENT = 64
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+_compiled = njit(nogil=True, error_model="numpy")
 _intrinsic: Any = intrinsic  # the caller does not pass the first argument, which its type does not say
 
 
@@ -145,7 +137,7 @@ def _leading(a: np.ndarray) -> int:
 
 
 @_compiled
-def room(shape: tuple[int, ...], like: np.ndarray) -> np.ndarray:
+def empty_aligned(shape: tuple[int, ...], like: np.ndarray) -> np.ndarray:
     """Return an array of like's type, its elements not set; where a matrix begins may decide how BLAS rounds."""
     size, elements = 1, _ALIGNMENT // like.itemsize
     for number in shape:
@@ -157,7 +149,7 @@ def room(shape: tuple[int, ...], like: np.ndarray) -> np.ndarray:
 
 # BLAS goes column by column, so that it sees every matrix transposed, and is asked for the transposed product.
 @_compiled
-def times(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -> None:
+def matmul(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -> None:
     """Write ``a @ b`` into out, or add it."""
     (m, k), n = a.shape, b.shape[1]
     _check(b.shape[0] == k and out.shape == (m, n), a, b, out)
@@ -165,7 +157,7 @@ def times(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -> None:
 
 
 @_compiled
-def times_transposed(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -> None:
+def matmul_nt(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -> None:
     """Write ``a @ b.T`` into out, or add it."""
     (m, k), n = a.shape, b.shape[0]
     _check(b.shape[1] == k and out.shape == (m, n), a, b, out)
@@ -173,7 +165,7 @@ def times_transposed(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -
 
 
 @_compiled
-def transposed_times(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -> None:
+def matmul_tn(a: np.ndarray, b: np.ndarray, out: np.ndarray, add: bool) -> None:
     """Write ``a.T @ b`` into out, or add it."""
     (k, m), n = a.shape, b.shape[1]
     _check(b.shape[0] == k and out.shape == (m, n), a, b, out)

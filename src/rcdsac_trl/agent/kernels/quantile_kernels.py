@@ -4,18 +4,51 @@ Rows go through all layers, matrix products included, in blocks that stay in the
 have N fractions each; H features, C cosines. What is constant along a sequence has one step.
 """
 
-import numba
+from typing import NamedTuple
+
 import numpy as np
 
 from rcdsac_trl.agent.kernels.feature_kernels import linear
-from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.agent.kernels.matmul import empty_aligned, matmul, matmul_nt, matmul_tn
+from rcdsac_trl.system.jit import njit
 
 #: Rows of (transition, quantile) that go through the layers together: an activation of theirs takes 512 kB.
 ROWS_PER_BLOCK = 1024
 
 # A sum over features may be added up in any order, which lets several be added at once. A loop has few arrays: of many
 # the compiler gives up showing that they are apart.
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
+
+
+class HeadWeights(NamedTuple):
+    """Weights behind the input layer; the gate's bias is part of beta's offsets."""
+
+    gate: np.ndarray  # of the fractions' cosines, [H, C]
+    hidden: np.ndarray
+    hidden_bias: np.ndarray
+    output: np.ndarray  # [H]
+    output_bias: np.ndarray
+
+
+class HeadActivations(NamedTuple):
+    """What the layers read and write on their way forth, and read on their way back."""
+
+    x: np.ndarray  # features of memory and action, [B, L, H]
+    cosines: np.ndarray  # of the fractions, [B, L|1, N, C]
+    beta: np.ndarray  # its part of the gates, [B, L|1, H]
+    tau_gate: np.ndarray  # the fractions' part of the gates, [B, L|1, N, H]
+    hidden: np.ndarray  # [B, L, N, H], or of some sequences alone where nothing goes back
+
+
+class HeadGradients(NamedTuple):
+    """Gradients that the way back adds to, as the fields of the same names in the others."""
+
+    x: np.ndarray
+    beta: np.ndarray
+    gate: np.ndarray
+    hidden: np.ndarray
+    hidden_bias: np.ndarray
+    output: np.ndarray
 
 
 @_compiled
@@ -133,14 +166,14 @@ def input_gradient(x: np.ndarray, weight: np.ndarray, d_x: np.ndarray, d_joined:
         row, d_row = rows[r], d_rows[r]
         for h in range(row.size):
             d_row[h] = d_row[h] if row[h] > zero else zero
-    times(d_rows, weight, _rows(d_joined), False)
+    matmul(d_rows, weight, _rows(d_joined), False)
 
 
 @_compiled
 def affine_gradient(d_out: np.ndarray, given: np.ndarray, d_weight: np.ndarray, d_bias: np.ndarray) -> None:
     """Write the gradients of a linear layer's weight and bias."""
     d_rows = _rows(d_out)
-    transposed_times(d_rows, _rows(given), d_weight, False)
+    matmul_tn(d_rows, _rows(given), d_weight, False)
     add_up(d_rows, d_bias)
 
 
@@ -160,64 +193,46 @@ def offsets(cosines: np.ndarray, weight: np.ndarray, bias: np.ndarray, beta: np.
     rows = _rows(beta)
     for r in range(rows.shape[0]):
         rows[r] = bias
-    times_transposed(_rows(cosines), weight, rows, True)
+    matmul_nt(_rows(cosines), weight, rows, True)
 
 
 @_compiled
-def layers(
-    x: np.ndarray,
-    cosines: np.ndarray,
-    beta: np.ndarray,
-    gate_weight: np.ndarray,
-    weight: np.ndarray,
-    bias: np.ndarray,
-    out_weight: np.ndarray,
-    out_bias: np.ndarray,
-    tau_gate: np.ndarray,
-    hidden: np.ndarray,
-    values: np.ndarray,
-) -> None:
-    """Write the gates, the hidden layer and the values; hidden may have room for some sequences alone."""
+def layers(activations: HeadActivations, weights: HeadWeights, values: np.ndarray) -> None:
+    """Write the gates, the hidden layer and the values ``[B, L, N]``."""
+    x, cosines, beta, tau_gate, hidden = activations
     sequences, steps, number = values.shape
-    times_transposed(_rows(cosines), gate_weight, _rows(tau_gate), False)
+    matmul_nt(_rows(cosines), weights.gate, _rows(tau_gate), False)
     size = block(steps * number, sequences)
-    product = room((size, steps, number, x.shape[2]), x)
+    product = empty_aligned((size, steps, number, x.shape[2]), x)
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         first = start if hidden.shape[0] >= sequences else 0
         inner, factors = _rows(hidden[first : first + stop - start]), product[: stop - start]
         _multiply(x[start:stop], tau_gate[start:stop], beta[start:stop], factors)
-        times_transposed(_rows(factors), weight, inner, False)
-        _output(inner, bias, out_weight, out_bias, values[start:stop].reshape(-1))
+        matmul_nt(_rows(factors), weights.hidden, inner, False)
+        _output(inner, weights.hidden_bias, weights.output, weights.output_bias, values[start:stop].reshape(-1))
 
 
 @_compiled
 def layers_gradient(
-    slopes: np.ndarray,
-    x: np.ndarray,
-    cosines: np.ndarray,
-    beta: np.ndarray,
-    tau_gate: np.ndarray,
-    hidden: np.ndarray,
-    through: np.ndarray,
-    d_x: np.ndarray,
-    d_beta: np.ndarray,
-    d_gate_weight: np.ndarray,
-    d_weight: np.ndarray,
-    d_bias: np.ndarray,
-    d_out_weight: np.ndarray,
+    slopes: np.ndarray, activations: HeadActivations, through: np.ndarray, gradients: HeadGradients
 ) -> None:
-    """Add the gradients of all layers; those of weight and bias lack the output's weight, a factor of each row."""
+    """Add the gradients of all layers; those of hidden and its bias lack the output's weight, a factor of each row.
+
+    ``slopes`` are the values' gradients ``[B, L, N]``, ``through`` is the hidden layer's weight times the output's.
+    """
+    x, cosines, beta, tau_gate, hidden = activations
+    d_x, d_beta, d_gate_weight, d_weight, d_bias, d_out_weight = gradients
     sequences, steps, number = slopes.shape
     size = block(steps * number, sequences)
-    product, d_hidden = room((size, steps, number, x.shape[2]), x), room((size, *hidden.shape[1:]), x)
-    d_tau_gate = room(tau_gate.shape, x)
+    product, d_hidden = empty_aligned((size, steps, number, x.shape[2]), x), empty_aligned((size, *hidden.shape[1:]), x)
+    d_tau_gate = empty_aligned(tau_gate.shape, x)
     d_tau_gate[:] = 0
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         factors, d_inner = product[: stop - start], _rows(d_hidden[: stop - start])
         _output_gradient(slopes[start:stop].reshape(-1), _rows(hidden[start:stop]), d_inner, d_bias, d_out_weight)
-        times(d_inner, through, _rows(factors), False)
+        matmul(d_inner, through, _rows(factors), False)
         _product_gradient(
             factors,
             x[start:stop],
@@ -227,28 +242,24 @@ def layers_gradient(
             d_tau_gate[start:stop],
             d_beta[start:stop],
         )
-        transposed_times(d_inner, _rows(factors), d_weight, True)
-    transposed_times(_rows(d_tau_gate), _rows(cosines), d_gate_weight, True)
+        matmul_tn(d_inner, _rows(factors), d_weight, True)
+    matmul_tn(_rows(d_tau_gate), _rows(cosines), d_gate_weight, True)
 
 
 @_compiled
 def gradient_of_features(
-    slopes: np.ndarray,
-    beta: np.ndarray,
-    tau_gate: np.ndarray,
-    hidden: np.ndarray,
-    through: np.ndarray,
-    d_x: np.ndarray,
+    slopes: np.ndarray, activations: HeadActivations, through: np.ndarray, d_x: np.ndarray
 ) -> None:
     """Add the gradient of x alone; transitions with a gradient of 0, of a critic not chosen, cost nothing."""
+    _, _, beta, tau_gate, hidden = activations
     sequences, steps, number = slopes.shape
     size = block(steps * number, sequences)
-    d_hidden = room((size * steps, number, hidden.shape[3]), d_x)
-    d_product = room((size * steps, number, d_x.shape[2]), d_x)
+    d_hidden = empty_aligned((size * steps, number, hidden.shape[3]), d_x)
+    d_product = empty_aligned((size * steps, number, d_x.shape[2]), d_x)
     for start in range(0, sequences, size):
         stop = min(start + size, sequences)
         sloping = _sloping_gradient(slopes[start:stop], hidden[start:stop], d_hidden)
-        times(_rows(d_hidden[:sloping]), through, _rows(d_product[:sloping]), False)
+        matmul(_rows(d_hidden[:sloping]), through, _rows(d_product[:sloping]), False)
         _features_gradient(slopes[start:stop], d_product, tau_gate[start:stop], beta[start:stop], d_x[start:stop])
 
 

@@ -4,12 +4,6 @@ It computes exactly what ordinary layers do (tests hold it against those, and ag
 of 6,400 transitions has 100,000 quantiles: as ordinary layers, every gate, product and activation of theirs is 50
 MB that goes to main memory and back between two operations. Of a batch of 256, calling the layers takes as long as
 what they compute. Here few compiled passes do it all, in blocks that stay in the cache.
-
-Public names::
-
-    HeadLayers(input, gate_tau, gate_beta | None, hidden, output)       the layers, a named tuple
-    quantile_values(memory [B,L,M], action [B,L,A], tau [B,L|1,N], beta [B,L|1,C] | None, frequencies [C], layers)
-        -> [B,L,N]
 """
 
 from typing import Any, NamedTuple
@@ -68,14 +62,19 @@ class _QuantileValues(torch.autograd.Function):
         tau_gate = memory.new_empty(gated, shared, number, len(w_tau))
         hidden = memory.new_empty(inner, steps, number, len(weight))
         result = memory.new_empty(sequences, steps, number)
-        inside = [value.numpy() for value in (w_tau, weight, bias, w_out.view(-1), b_out)]
+        weights = kernels.HeadWeights(*(value.numpy() for value in (w_tau, weight, bias, w_out.view(-1), b_out)))
         features, added, values = x.numpy(), offsets.numpy(), result.numpy()
         for block in blocks:
             place = block if keep else slice(0, block.stop - block.start)
             torch.cos(tau[block].unsqueeze(-1) * frequencies, out=cosines[place])
-            given = [features[block], cosines[place].numpy(), added[block]]
-            rooms = [tau_gate[place].numpy(), hidden[place].numpy() if keep else hidden.numpy()]
-            kernels.layers(*(given + inside + rooms + [values[block]]))
+            activations = kernels.HeadActivations(
+                features[block],
+                cosines[place].numpy(),
+                added[block],
+                tau_gate[place].numpy(),
+                hidden[place].numpy() if keep else hidden.numpy(),
+            )
+            kernels.layers(activations, weights, values[block])
         if keep:
             ctx.save_for_backward(joined, x, beta, offsets, cosines, tau_gate, hidden, w_in, w_tau, weight, w_out)
             ctx.memory_size = memory.shape[-1]
@@ -91,18 +90,19 @@ class _QuantileValues(torch.autograd.Function):
         through = weight * column
         d_x, d_joined = torch.zeros_like(x), torch.empty_like(joined)
         d_layers: tuple[Tensor | None, ...] = (None,) * 9
+        seen = kernels.HeadActivations(*(value.numpy() for value in (x, cosines, offsets, tau_gate, hidden)))
+        slopes = gradient.numpy()
         if not ctx.needs_input_grad[5]:
-            known = gradient, offsets, tau_gate, hidden, through
-            kernels.gradient_of_features(*(value.numpy() for value in (*known, d_x)))
+            kernels.gradient_of_features(slopes, seen, through.numpy(), d_x.numpy())
             kernels.input_gradient(*(value.numpy() for value in (x, w_in, d_x, d_joined)))
         else:
             d_offsets, d_tau = torch.zeros_like(offsets), torch.zeros_like(w_tau)
             d_weight, (d_bias, d_out) = torch.zeros_like(weight), weight.new_zeros(2, len(weight))
-            along = [value.numpy() for value in (gradient, x, cosines, offsets, tau_gate, hidden)]
-            sums = [value.numpy() for value in (d_tau, d_weight, d_bias, d_out)]
+            sums = kernels.HeadGradients(*(value.numpy() for value in (d_x, d_offsets, d_tau, d_weight, d_bias, d_out)))
             for block in _gate_blocks(tau_gate):
-                written = [value.numpy() for value in (through, d_x[block], d_offsets[block])]
-                kernels.layers_gradient(*([value[block] for value in along] + written + sums))
+                activations = kernels.HeadActivations(*(value[block] for value in seen))
+                gradients = sums._replace(x=sums.x[block], beta=sums.beta[block])
+                kernels.layers_gradient(slopes[block], activations, through.numpy(), gradients)
             kernels.input_gradient(*(value.numpy() for value in (x, w_in, d_x, d_joined)))
             d_in, (d_b_in, d_b_tau) = torch.empty_like(w_in), w_in.new_empty(2, len(w_in))
             kernels.affine_gradient(*(value.numpy() for value in (d_x, joined, d_in, d_b_in)))

@@ -4,30 +4,44 @@ It computes exactly what ``nn.GRU`` does (tests hold it against that, and agains
 records some twenty operations a step for its backward pass, among them a matrix product for every weight. Here all
 steps, forth or back, are one compiled pass, with one matrix product a step; whatever does not wait for another step is
 one product over all of them.
-
-Public names::
-
-    gated_recurrence(inputs [T,B,I], gru) -> [T,B,H]
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
+from numba import types
 from numba.extending import overload
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from rcdsac_trl.agent.kernels.matmul import room, times, times_transposed, transposed_times
+from rcdsac_trl.agent.kernels.matmul import empty_aligned, matmul, matmul_nt, matmul_tn
+from rcdsac_trl.system.jit import njit
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+_compiled = njit(nogil=True, error_model="numpy", fastmath={"contract"})
 
 # tanh(x) = x P(x^2) / Q(x^2), fitted to 1e-8 of tanh for |x| up to the limit, where float32 has no number left below 1.
 _LIMIT = np.float32(8.5)
 _P0, _P1, _P2, _P3, _P4 = (np.float32(c) for c in (1.0, 1.3413249e-1, 3.5340297e-3, 2.1251091e-5, 1.4269291526e-8))
 _Q0, _Q1, _Q2, _Q3, _Q4 = (np.float32(c) for c in (1.0, 4.6746573e-1, 2.6022762e-2, 3.348869404e-4, 8.1451497636e-7))
+
+
+class _Weights(NamedTuple):
+    """Weights and biases for what comes in and for what is remembered, or their gradients."""
+
+    w_in: np.ndarray
+    w_re: np.ndarray
+    b_in: np.ndarray
+    b_re: np.ndarray
+
+
+class _Activations(NamedTuple):
+    """What the steps write on their way forth and read on their way back."""
+
+    gates: np.ndarray  # r, z, n, [T, B, 3 H]
+    recurrent: np.ndarray  # what the state contributes to them, [T, B, 3 H]
+    states: np.ndarray  # from the first, 0, to the last, [T + 1, B, H]
 
 
 def _tanh(x: Any) -> Any:
@@ -50,7 +64,7 @@ def _compiled_tanh(x: Any) -> Callable[[Any], Any]:
     def exact(x: Any) -> Any:
         return np.tanh(x)
 
-    return rational if x == numba.types.float32 else exact
+    return rational if x == types.float32 else exact
 
 
 # Rows are sliced into gates rather than indexed at an offset: only so does the compiler know that they are contiguous.
@@ -105,22 +119,15 @@ def _step_gradient(
 
 
 @_compiled
-def _steps(
-    x: np.ndarray,
-    w_in: np.ndarray,
-    w_re: np.ndarray,
-    b_in: np.ndarray,
-    b_re: np.ndarray,
-    gates: np.ndarray,
-    recurrent: np.ndarray,
-    states: np.ndarray,
-) -> None:
+def _steps(x: np.ndarray, weights: _Weights, activations: _Activations) -> None:
     """Do all steps from the state 0."""
+    w_in, w_re, b_in, b_re = weights
+    gates, recurrent, states = activations
     states[0], recurrent[0] = 0, 0
-    times_transposed(x, w_in, gates.reshape(x.shape[0], -1), False)
+    matmul_nt(x, w_in, gates.reshape(x.shape[0], -1), False)
     for t in range(gates.shape[0]):
         if t > 0:
-            times_transposed(states[t], w_re, recurrent[t], False)
+            matmul_nt(states[t], w_re, recurrent[t], False)
         _step(gates[t], recurrent[t], b_in, b_re, states[t], states[t + 1])
 
 
@@ -128,29 +135,30 @@ def _steps(
 def _steps_gradient(
     gradient: np.ndarray,
     x: np.ndarray,
-    w_in: np.ndarray,
-    w_re: np.ndarray,
-    gates: np.ndarray,
-    recurrent: np.ndarray,
-    states: np.ndarray,
+    weights: _Weights,
+    activations: _Activations,
     d_x: np.ndarray,
-    d_w_in: np.ndarray,
-    d_w_re: np.ndarray,
-    d_b_in: np.ndarray,
-    d_b_re: np.ndarray,
+    gradients: _Weights,
 ) -> None:
     """Write the gradients of the inputs and of the weights."""
-    d_inputs, d_recurrent, carried = room(gates.shape, x), room(gates.shape, x), room(states.shape[1:], x)
+    w_in, w_re, _, _ = weights
+    gates, recurrent, states = activations
+    d_w_in, d_w_re, d_b_in, d_b_re = gradients
+    d_inputs, d_recurrent, carried = (
+        empty_aligned(gates.shape, x),
+        empty_aligned(gates.shape, x),
+        empty_aligned(states.shape[1:], x),
+    )
     carried[:] = 0
     for t in range(len(gates) - 1, -1, -1):
         _step_gradient(gradient[t], carried, gates[t], recurrent[t], states[t], d_inputs[t], d_recurrent[t])
         if t > 0:
-            times(d_recurrent[t], w_re, carried, True)
+            matmul(d_recurrent[t], w_re, carried, True)
     rows, first, size = x.shape[0], states.shape[1], states.shape[2]
     of_inputs, of_states = d_inputs.reshape(rows, -1), d_recurrent.reshape(rows, -1)
-    times(of_inputs, w_in, d_x, False)
-    transposed_times(of_inputs, x, d_w_in, False)
-    transposed_times(of_states[first:], states[1:-1].reshape(rows - first, size), d_w_re, False)
+    matmul(of_inputs, w_in, d_x, False)
+    matmul_tn(of_inputs, x, d_w_in, False)
+    matmul_tn(of_states[first:], states[1:-1].reshape(rows - first, size), d_w_re, False)
     d_b_in[:], d_b_re[:] = 0, 0
     for r in range(rows):
         row, other = of_inputs[r], of_states[r]
@@ -169,19 +177,27 @@ class _GatedRecurrence(torch.autograd.Function):
         gates = inputs.new_empty(steps, rows, 3 * size)  # r, z, n
         recurrent, states = torch.empty_like(gates), inputs.new_empty(steps + 1, rows, size)
         weights = w_in, w_re, b_in, b_re
-        _steps(*(value.numpy() for value in (x, *weights, gates, recurrent, states)))
-        ctx.save_for_backward(x, w_in, w_re, gates, recurrent, states)
+        _steps(x.numpy(), _weights(weights), _activations(gates, recurrent, states))
+        ctx.save_for_backward(x, *weights, gates, recurrent, states)
         return states[1:]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
-        x, w_in, w_re, gates, recurrent, states = ctx.saved_tensors
-        d_x, d_w_in, d_w_re = torch.empty_like(x), torch.empty_like(w_in), torch.empty_like(w_re)
-        d_b_in, d_b_re = w_in.new_empty(2, len(w_in))
-        known = gradient.contiguous(), x, w_in, w_re, gates, recurrent, states
-        _steps_gradient(*(value.numpy() for value in (*known, d_x, d_w_in, d_w_re, d_b_in, d_b_re)))
-        return d_x.view(*gates.shape[:2], -1), d_w_in, d_w_re, d_b_in, d_b_re
+        x, *weights, gates, recurrent, states = ctx.saved_tensors
+        d_x, gradients = torch.empty_like(x), [torch.empty_like(value) for value in weights]
+        activations = _activations(gates, recurrent, states)
+        slopes = gradient.contiguous().numpy()
+        _steps_gradient(slopes, x.numpy(), _weights(weights), activations, d_x.numpy(), _weights(gradients))
+        return d_x.view(*gates.shape[:2], -1), *gradients
+
+
+def _weights(tensors: Sequence[Tensor]) -> _Weights:
+    return _Weights(*(value.numpy() for value in tensors))
+
+
+def _activations(*tensors: Tensor) -> _Activations:
+    return _Activations(*(value.numpy() for value in tensors))
 
 
 def gated_recurrence(inputs: Tensor, gru: nn.GRU) -> Tensor:

@@ -2,11 +2,6 @@
 
 Torch gives its threads to one operation after another, and what lies between two matrix products runs on one of them.
 Here each thread does the whole work of some sequences, forwards and backwards, and they meet once.
-
-Public names::
-
-    cut(sequences, steps) -> slices         one where parts do not pay
-    in_parts(compute, groups, parts) -> losses and diagnostics
 """
 
 import functools
@@ -24,7 +19,7 @@ from torch.autograd.function import once_differentiable
 _TRANSITIONS_PER_PART = 1024
 
 
-def cut(sequences: int, steps: int) -> list[slice]:
+def split_batch(sequences: int, steps: int) -> list[slice]:
     """Cut a batch into as many parts as torch has threads, fewer where they would be small.
 
     Args:
@@ -32,7 +27,7 @@ def cut(sequences: int, steps: int) -> list[slice]:
         steps: of a sequence.
 
     Example:
-        >>> cut(sequences=3, steps=8)
+        >>> split_batch(sequences=3, steps=8)
         [slice(0, 3, None)]
     """
     number = max(1, min(torch.get_num_threads(), sequences * steps // _TRANSITIONS_PER_PART, sequences))
@@ -40,7 +35,7 @@ def cut(sequences: int, steps: int) -> list[slice]:
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
 
-def in_parts(
+def parallel_backward(
     compute: Callable[[slice], dict[str, Tensor]], groups: dict[str, list[nn.Parameter]], parts: list[slice]
 ) -> dict[str, Tensor]:
     """Return the sums of what the parts return; the backward pass of each is done in its thread, too.

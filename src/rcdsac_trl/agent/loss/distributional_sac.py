@@ -1,18 +1,4 @@
-r"""Distributional soft actor-critic on sequences: critic, actor and temperature loss.
-
-Public names::
-
-    DistributionalSACLoss(actor, critics, *, measure=None, num_quantiles=16, num_target_quantiles=16,
-                          num_risk_samples=16, fractions_per="sequence", fraction_sampling="uniform", kappa=1.0,
-                          loss_function="smooth_l1", alpha_init=1.0, target_entropy=-2.0, burn_in=0,
-                          target_over_critics="minimum", reduction="mean", generator=None)
-        forward(batch [B, L+1]) -> loss_actor, loss_qvalue, loss_alpha, alpha, entropy, td_error, q_value
-                                   (, quantile_spread)
-        .make_value_estimator(gamma=0.99)   .set_keys(...)   .rng_state (get and set; also in state_dict)
-        .draw(batch), .encode_actor(batch), .compute_target(..), .qvalue_loss(..), .actor_loss(..): what forward does
-        SoftUpdate(loss, eps=...) works; parameters: loss.actor_network_params, loss.critic_network_params,
-        loss.log_alpha
-"""
+r"""Distributional soft actor-critic on sequences: critic, actor and temperature loss."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -22,13 +8,15 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
-from torchrl.objectives.utils import _reduce, distance_loss
+from torch.nn import functional as F
+from torchrl.objectives.utils import _reduce
 from torchrl.objectives.value.functional import td0_return_estimate
 
-from rcdsac_trl.agent.loss.batch_threads import cut, in_parts
+from rcdsac_trl.agent.loss.batch_threads import parallel_backward, split_batch
 from rcdsac_trl.agent.loss.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
 from rcdsac_trl.agent.loss.linked_loss import LinkedLoss
-from rcdsac_trl.agent.loss.samples import Draws, draw
+from rcdsac_trl.agent.loss.loss_settings import LossSettings
+from rcdsac_trl.agent.loss.samples import LossSamples, draw_samples
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
 
 #: What a target can take of the target critics.
@@ -64,25 +52,7 @@ class DistributionalSACLoss(LinkedLoss):
         critics: one or two (or more) independent critics, from :func:`rcdsac_trl.agent.actor.build_critic`; the
             head that reads ``tau`` is a quantile head, else it is scalar.
         measure: distorts the fractions of the actor loss; required with quantile critics.
-        num_quantiles: N, fractions of the prediction.
-        num_target_quantiles: N', fractions of the target.
-        num_risk_samples: K, fractions of the risk-adjusted value.
-        fractions_per: draw fractions anew for every ``"transition"``, or once a ``"sequence"``; each term of the
-            loss has the same distribution, but the gates of a sequence are then computed once.
-        fraction_sampling: ``"uniform"`` draws a set of fractions independently; ``"stratified"`` draws one in each of
-            as many equal parts of [0, 1]. A loss's sum over a set has the same expectation, but a stratified set misses
-            no part of the return: the variance of the mean of N falls with :math:`N^{-3}` where quantiles are smooth,
-            not :math:`N^{-1}`.
-        kappa: threshold of the Huber loss.
-        loss_function: error of scalar critics, ``"smooth_l1"`` or ``"l2"``, as in TorchRL's SAC.
-        alpha_init: temperature at the start, above 0.
-        target_entropy: the entropy the temperature aims for, in nats.
-        burn_in: number of leading transitions of a sequence that only warm the memory up and carry no loss.
-        target_over_critics: what the target takes of the target critics: at each fraction their ``"minimum"`` or
-            ``"mean"``, or all fractions of the one whose mean is the ``"smaller"``. The minimum of two quantile
-            functions that disagree lowers *both* tails, and bootstrapping adds that up; choosing a whole function
-            lowers the mean alone, as with scalar critics, where it is the minimum; the mean has no such bias, but the
-            policy then finds what both overestimate.
+        settings: hyper-parameters; None for the defaults.
         reduction: ``"mean"``, ``"sum"`` or ``"none"``; over batch and time. ``"none"`` leaves every entry of the
             output ``[B, L - burn_in]``.
         generator: source of all random numbers; None for one seeded with 0. Its state is part of ``state_dict``.
@@ -110,19 +80,9 @@ class DistributionalSACLoss(LinkedLoss):
         self,
         actor: TensorDictSequential,
         critics: Sequence[TensorDictSequential],
+        settings: LossSettings | None = None,
         *,
         measure: RiskMeasure | None = None,
-        num_quantiles: int = 16,
-        num_target_quantiles: int = 16,
-        num_risk_samples: int = 16,
-        fractions_per: Literal["sequence", "transition"] = "sequence",
-        fraction_sampling: Literal["uniform", "stratified"] = "uniform",
-        kappa: float = 1.0,
-        loss_function: Literal["smooth_l1", "l2"] = "smooth_l1",
-        alpha_init: float = 1.0,
-        target_entropy: float = -2.0,
-        burn_in: int = 0,
-        target_over_critics: Literal["minimum", "smaller", "mean"] = "minimum",
         reduction: Literal["mean", "sum", "none"] = "mean",
         generator: torch.Generator | None = None,
     ) -> None:
@@ -130,37 +90,16 @@ class DistributionalSACLoss(LinkedLoss):
         super().__init__()
         if not critics:
             raise ValueError("give at least one critic")
-        if min(num_quantiles, num_target_quantiles, num_risk_samples) < 1:
-            raise ValueError("the numbers of quantile fractions must be at least 1")
-        if alpha_init <= 0.0 or kappa <= 0.0:
-            raise ValueError(f"alpha_init = {alpha_init:g} and kappa = {kappa:g} must be above 0")
-        if burn_in < 0:
-            raise ValueError(f"burn_in = {burn_in} must be at least 0")
-        if fractions_per not in ("sequence", "transition"):
-            raise ValueError(f"fractions_per = {fractions_per!r} must be 'sequence' or 'transition'")
-        if fraction_sampling not in ("uniform", "stratified"):
-            raise ValueError(f"fraction_sampling = {fraction_sampling!r} must be 'uniform' or 'stratified'")
-        if loss_function not in ("smooth_l1", "l2"):
-            raise ValueError(f"loss_function = {loss_function!r} must be 'smooth_l1' or 'l2'")
-        if target_over_critics not in OVER_CRITICS:
-            raise ValueError(f"target_over_critics = {target_over_critics!r} must be one of {', '.join(OVER_CRITICS)}")
         if reduction not in ("mean", "sum", "none"):
             raise ValueError(f"reduction = {reduction!r} must be 'mean', 'sum' or 'none'")
-        self.log_alpha = nn.Parameter(torch.tensor(math.log(alpha_init), dtype=torch.float32, device="cpu"))
+        self.settings = settings or LossSettings()
+        self.log_alpha = nn.Parameter(
+            torch.tensor(math.log(self.settings.alpha_init), dtype=torch.float32, device="cpu")
+        )
         self._link_networks(actor, critics)
         if self._distributional and measure is None:
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
         self.measure = measure or Neutral()
-        self.num_quantiles = num_quantiles
-        self.num_target_quantiles = num_target_quantiles
-        self.num_risk_samples = num_risk_samples
-        self.fractions_per = fractions_per
-        self.fraction_sampling = fraction_sampling
-        self.kappa = kappa
-        self.loss_function = loss_function
-        self.target_entropy = target_entropy
-        self.burn_in = burn_in
-        self.target_over_critics = target_over_critics
         self.reduction = reduction
         #: How much of beta counts in the actor's loss; the trainer lets it grow from 0 (as if neutral) to 1 (all).
         #: The networks are told the whole beta from the start, so that no value of it is ever new to them.
@@ -175,65 +114,65 @@ class DistributionalSACLoss(LinkedLoss):
         nats, ``td_error`` the mean absolute pairwise temporal difference (largest over the critics), ``q_value`` the
         mean prediction and ``quantile_spread`` the standard deviation over a prediction's sampled quantiles.
         """
-        if tensordict.ndim != 2 or tensordict.shape[1] < self.burn_in + 2:
+        if tensordict.ndim != 2 or tensordict.shape[1] < self.settings.burn_in + 2:
             raise ValueError(
-                f"expected a batch [sequences, steps + 1] with more than burn_in = {self.burn_in} steps, "
+                f"expected a batch [sequences, steps + 1] with more than burn_in = {self.settings.burn_in} steps, "
                 f"got {list(tensordict.shape)}"
             )
-        draws = self.draw(tensordict)
+        samples = self.draw_samples(tensordict)
         if self.reduction == "none":
-            losses, diagnostics = self._losses(tensordict, draws)
+            losses, diagnostics = self._losses(tensordict, samples)
             diagnostics["alpha"] = self.alpha.expand_as(losses["loss_actor"])
             return TensorDict(losses | diagnostics, batch_size=losses["loss_actor"].shape)
-        parts = cut(*draws.noise.shape[:2])
-        if len(parts) == 1 or not torch.is_grad_enabled() or draws.noise.device.type != "cpu":
-            return TensorDict(self._reduced(tensordict, draws))
+        parts = split_batch(*samples.noise.shape[:2])
+        if len(parts) == 1 or not torch.is_grad_enabled() or samples.noise.device.type != "cpu":
+            return TensorDict(self._reduced(tensordict, samples))
 
         def compute(part: slice) -> dict[str, Tensor]:
             share = (part.stop - part.start) / len(tensordict)
             summed = self._trained if self.reduction == "sum" else {}
-            reduced = self._reduced(tensordict[part], draws.rows(part))
+            reduced = self._reduced(tensordict[part], samples.rows(part))
             return {key: value if key in summed else share * value for key, value in reduced.items()}
 
-        return TensorDict(in_parts(compute, self._trained, parts))
+        return TensorDict(parallel_backward(compute, self._trained, parts))
 
-    def _losses(self, tensordict: TensorDictBase, draws: Draws) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _losses(self, tensordict: TensorDictBase, samples: LossSamples) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return the losses and detached diagnostics, ``[B, L - burn_in]`` but for ``alpha``."""
         actor_memory = self.encode_actor(tensordict)
-        loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory, draws)
-        loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories, draws)
-        loss_alpha = -self.log_alpha * (log_prob + self.target_entropy)
+        loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory, samples)
+        loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories, samples)
+        loss_alpha = -self.log_alpha * (log_prob + self.settings.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha}
         return losses, diagnostics | {"alpha": self.alpha, "entropy": -log_prob}
 
-    def _reduced(self, tensordict: TensorDictBase, draws: Draws) -> dict[str, Tensor]:
+    def _reduced(self, tensordict: TensorDictBase, samples: LossSamples) -> dict[str, Tensor]:
         """Return the reduced losses and the diagnostics' means."""
-        losses, diagnostics = self._losses(tensordict, draws)
+        losses, diagnostics = self._losses(tensordict, samples)
         reduced = {key: _reduce(value, self.reduction) for key, value in losses.items()}
         return reduced | {key: value.mean() for key, value in diagnostics.items()}
 
-    def draw(self, tensordict: TensorDictBase) -> Draws:
+    def draw_samples(self, tensordict: TensorDictBase) -> LossSamples:
         """Draw all random numbers that a batch ``[B, L+1]`` needs."""
-        numbers = (self.num_target_quantiles, self.num_quantiles, self.num_risk_samples)
-        action = tensordict.get(self.tensor_keys.action)[:, self.burn_in : -1]
-        sampling = self.fractions_per, self.fraction_sampling
-        return draw(action, numbers if self._distributional else None, *sampling, self._generator)
+        numbers = (self.settings.num_target_quantiles, self.settings.num_quantiles, self.settings.num_risk_samples)
+        action = tensordict.get(self.tensor_keys.action)[:, self.settings.burn_in : -1]
+        sampling = self.settings.fractions_per, self.settings.fraction_sampling
+        return draw_samples(action, numbers if self._distributional else None, *sampling, self._generator)
 
     def encode_actor(self, tensordict: TensorDictBase) -> Tensor:
         """Return the actor's memory of every observation, ``[B, L + 1 - burn_in, memory]``."""
         return self._encode(self.actor_network, tensordict)
 
-    def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor, draws: Draws) -> Tensor:
+    def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples) -> Tensor:
         """Return the target samples ``[B, L - burn_in, N']`` (scalar critics: N' = 1), without gradient."""
         risk = self._risk(tensordict)
         with torch.no_grad():
-            action, log_prob = self._act(actor_memory[:, 1:], risk, draws.next_noise)
+            action, log_prob = self._act(actor_memory[:, 1:], risk, samples.next_noise)
             _ = self.target_critic_network_params  # TorchRL warns here where nothing updates them
             values = []
             for critic in self._target_critics:
                 memory = self._encode(critic, tensordict)[:, 1:]
-                values.append(self._evaluate(critic, memory, action, draws.next_tau, risk))
-            next_value = OVER_CRITICS[self.target_over_critics](values)
+                values.append(self._evaluate(critic, memory, action, samples.next_tau, risk))
+            next_value = OVER_CRITICS[self.settings.target_over_critics](values)
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
             # What TorchRL's estimator calls, with its shapes: every target fraction gets its own entry.
             reward = self._transitions(tensordict, ("next", self.tensor_keys.reward)).expand_as(next_value)
@@ -241,14 +180,14 @@ class DistributionalSACLoss(LinkedLoss):
             return td0_return_estimate(self.value_estimator.gamma, next_value, reward, terminated)
 
     def qvalue_loss(
-        self, tensordict: TensorDictBase, actor_memory: Tensor, draws: Draws
+        self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples
     ) -> tuple[Tensor, list[Tensor], dict[str, Tensor]]:
         """Return the critic loss, the critics' memories for :meth:`actor_loss`, and detached diagnostics.
 
         The loss ``[B, L - burn_in]`` is summed over the critics; a memory is ``[B, L - burn_in, memory]``.
         """
-        target = self.compute_target(tensordict, actor_memory, draws)
-        action, risk, tau = self._transitions(tensordict, self.tensor_keys.action), self._risk(tensordict), draws.tau
+        target = self.compute_target(tensordict, actor_memory, samples)
+        action, risk, tau = self._transitions(tensordict, self.tensor_keys.action), self._risk(tensordict), samples.tau
         # No transition starts at the last observation.
         memories = [self._encode(critic, tensordict, stop=-1) for critic in self._critics]
         values = [
@@ -256,17 +195,17 @@ class DistributionalSACLoss(LinkedLoss):
             for critic, memory in zip(self._critics, memories, strict=True)
         ]
         if tau is None:
-            errors = [distance_loss(value, target, self.loss_function).squeeze(-1) for value in values]
+            errors = [F.smooth_l1_loss(value, target, reduction="none").squeeze(-1) for value in values]
         else:
-            errors = [quantile_huber_loss(value, target, tau, self.kappa) for value in values]
+            errors = [quantile_huber_loss(value, target, tau, self.settings.kappa) for value in values]
         return torch.stack(errors).sum(0), memories, self._diagnose(values, target)
 
     def actor_loss(
-        self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor], draws: Draws
+        self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor], samples: LossSamples
     ) -> tuple[Tensor, Tensor]:
         """Return the actor loss and the detached log density of its action, both ``[B, L - burn_in]``."""
-        risk, tau = self._risk(tensordict), draws.risk_tau
-        action, log_prob = self._act(actor_memory[:, :-1], risk, draws.noise)
+        risk, tau = self._risk(tensordict), samples.risk_tau
+        action, log_prob = self._act(actor_memory[:, :-1], risk, samples.noise)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
         values = [
@@ -279,10 +218,10 @@ class DistributionalSACLoss(LinkedLoss):
     def _encode(self, network: TensorDictSequential, tensordict: TensorDictBase, stop: int | None = None) -> Tensor:
         encoder = network[0]
         (memory,) = call_module(encoder, {key: tensordict.get(key)[:, :stop] for key in encoder.in_keys})
-        return memory[:, self.burn_in :]
+        return memory[:, self.settings.burn_in :]
 
     def _transitions(self, tensordict: TensorDictBase, key: NestedKey | tuple) -> Tensor:
-        return tensordict.get(unravel_key(key))[:, self.burn_in : -1]
+        return tensordict.get(unravel_key(key))[:, self.settings.burn_in : -1]
 
     def _risk(self, tensordict: TensorDictBase) -> Tensor | None:
         """Return beta per transition, a time dimension of 1 where it is one value expanded; None for scalar critics.

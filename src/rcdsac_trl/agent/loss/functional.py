@@ -1,12 +1,4 @@
-"""The pure functions of the loss.
-
-Public names::
-
-    quantile_huber_loss(quantiles [..,N], targets [..,N'], tau [..,N], kappa=1) -> [..]
-    squash(loc, scale, noise) -> action, log_prob
-    call_module(module, entries) -> what it writes, by its keys' order
-    minimum(values), mean(values) -> element-wise; smaller(values) -> of each entry, all of the critic with smaller mean
-"""
+"""The pure functions of the loss."""
 
 import math
 
@@ -16,6 +8,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from rcdsac_trl.agent.kernels import dispatch
 from rcdsac_trl.agent.kernels.huber_kernel import quantile_huber
 
 
@@ -83,11 +76,12 @@ def call_module(module: TensorDictModuleBase, entries: dict[NestedKey, Tensor | 
     """Run an encoder or a head on the entries it reads, and return what it writes, in the order of its keys.
 
     The first dimension of the entries is the batch's; their time dimensions may be 1. A plain ``TensorDictModule``'s
-    network is called directly: TensorDicts of its inputs and outputs cost as much as a small batch's layers.
+    network, or its compiled twin, is called directly: TensorDicts of its inputs and outputs cost as much as a small
+    batch's layers.
     """
     inputs = [entries[key] for key in module.in_keys]
     if type(module) is TensorDictModule:
-        outputs = module.module(*inputs)
+        outputs = dispatch.forward(module.module, *inputs)
         return outputs if isinstance(outputs, tuple) else (outputs,)
     memory = next(value for value in inputs if value is not None)
     written = module(TensorDict(dict(zip(module.in_keys, inputs, strict=True)), batch_size=memory.shape[:1]))

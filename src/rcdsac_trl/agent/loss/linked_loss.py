@@ -1,12 +1,4 @@
-r"""A loss whose networks hold its parameters, and whose random numbers come from one generator.
-
-Public names::
-
-    LinkedLoss                     LossModule with an actor, critics, target critics and a generator
-        ._link_networks(actor, critics)      makes them functional; the subclass calls it once
-        .rng_state                           get and set; also in state_dict
-        .make_value_estimator(gamma=0.99)    .in_keys    .out_keys
-"""
+r"""A loss whose networks hold its parameters, and whose random numbers come from one generator."""
 
 import copy
 from collections.abc import Callable, Sequence

@@ -1,11 +1,6 @@
 """Every random number of one call of the loss, drawn before anything is computed.
 
 So whoever computes the loss in parts gives each sequence the numbers that it has in the whole.
-
-Public names::
-
-    Draws(next_noise, next_tau, tau, noise, risk_tau)       a NamedTuple; .rows(slice) -> those of some sequences
-    draw(action [B,L,A], numbers | None, fractions_per, fraction_sampling, generator) -> Draws
 """
 
 from typing import NamedTuple
@@ -14,7 +9,7 @@ import torch
 from torch import Tensor
 
 
-class Draws(NamedTuple):
+class LossSamples(NamedTuple):
     """Random numbers of a batch; all fractions are None for scalar critics.
 
     Attributes:
@@ -31,22 +26,22 @@ class Draws(NamedTuple):
     noise: Tensor
     risk_tau: Tensor | None
 
-    def rows(self, sequences: slice) -> "Draws":
+    def rows(self, sequences: slice) -> "LossSamples":
         """Return the numbers of some sequences."""
         tau, next_tau, risk_tau = (
             None if fractions is None else fractions[sequences]
             for fractions in (self.tau, self.next_tau, self.risk_tau)
         )
-        return Draws(self.next_noise[sequences], next_tau, tau, self.noise[sequences], risk_tau)
+        return LossSamples(self.next_noise[sequences], next_tau, tau, self.noise[sequences], risk_tau)
 
 
-def draw(
+def draw_samples(
     action: Tensor,
     numbers: tuple[int, int, int] | None,
     fractions_per: str,
     fraction_sampling: str,
     generator: torch.Generator,
-) -> Draws:
+) -> LossSamples:
     """Draw what a batch needs, on the generator's device, and bring it to the batch's.
 
     Args:
@@ -69,4 +64,4 @@ def draw(
             drawn = (drawn + torch.arange(numbers[which], device=action.device)) / numbers[which]
         return drawn
 
-    return Draws(noise(), fractions(0), fractions(1), noise(), fractions(2))
+    return LossSamples(noise(), fractions(0), fractions(1), noise(), fractions(2))

@@ -1,10 +1,4 @@
-"""The steps of the target critics and of the averaged actor.
-
-Public names::
-
-    FusedSoftUpdate(loss, *, eps | tau)     TorchRL's SoftUpdate, all parameters in one call
-    FusedAverage(model, decay)              torch's AveragedModel, exponential, its parameters listed once
-"""
+"""The steps of the target critics and of the averaged actor."""
 
 from typing import Any
 

@@ -65,7 +65,7 @@ def export_agent(weights: Weights, num_quantiles: int = 16) -> Exported:
     """
     fractions = fractions_of(num_quantiles)
     modules: tuple[nn.Module, nn.Module] = (
-        ActorStep(weights).eval(),
+        ActorStep.of_weights(weights).eval(),
         CriticStep(weights, torch.from_numpy(fractions)).eval(),
     )
     inputs = example_inputs(weights)
@@ -206,8 +206,9 @@ def _torch_runner(module: Callable[..., tuple[Tensor, Tensor]], names: tuple[str
 
 def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Runner]:
     config, mask = weights.config, sensor_mask(weights.config.sensor)
-    own = Encoders([weights.part("actor.encoder")], mask)
-    theirs = Encoders([weights.part(f"critics.{number}.encoder") for number in range(config.num_critics)], mask)
+    critic_encoders = [weights.part(f"critics.{number}.encoder") for number in range(config.num_critics)]
+    own = Encoders([weights.part("actor.encoder")], mask, config.padding)
+    theirs = Encoders(critic_encoders, mask, config.padding)
     actor, critics = Actor(weights), Critics(weights, fractions)
 
     def told(inputs: dict[str, Array]) -> tuple[Array, float | None]:

@@ -1,9 +1,11 @@
 """An agent as torch modules that take one step: what is exported, and what everything else is held against."""
 
+from typing import Self
+
 import torch
 from torch import Tensor, nn
 
-from rcdsac_trl.agent.networks import ActorHead, Encoder, QuantileHead, ScalarHead, Widths
+from rcdsac_trl.agent.networks import ActorHead, Encoder, HistoryEncoder, NetworkSettings, QuantileHead, ScalarHead
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights
 
@@ -14,22 +16,28 @@ class ActorStep(nn.Module):
     """One step of the actor: observations, what it is told and the memory before to the action and the memory after.
 
     Args:
-        weights: of the agent.
+        encoder: of the actor, ours or yours.
+        head: of the actor.
+        weighted: whether the encoder reads the collision weight.
     """
 
-    def __init__(self, weights: Weights) -> None:
+    def __init__(self, encoder: HistoryEncoder, head: ActorHead, *, weighted: bool = False) -> None:
         super().__init__()
-        config, widths = weights.config, Widths(**weights.config.network)
-        self.encoder = Encoder(config.vectors, widths)
-        self.head = ActorHead(ACTION_SIZE, widths, measure_of(config))
-        self.weighted = config.context == "collision_weight"
-        _load(self.encoder, weights, "actor.encoder")
-        _load(self.head, weights, "actor.head")
+        self.encoder, self.head, self.weighted = encoder, head, weighted
+
+    @classmethod
+    def of_weights(cls, weights: Weights) -> Self:
+        """Make the step of an agent's actor."""
+        config, network = weights.config, _network_of(weights.config)
+        encoder, head = Encoder(config.vectors, network), ActorHead(ACTION_SIZE, network, measure_of(config))
+        _load(encoder, weights, "actor.encoder")
+        _load(head, weights, "actor.head")
+        return cls(encoder, head, weighted=config.context == "collision_weight")
 
     def forward(
         self, range_: Tensor, waypoint: Tensor, velocity: Tensor, context: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the action tanh(mean) [B, 2] and the next memory [B, memory].
+        """Return the action tanh(mean) [B, 2] and the encoder's next state, its memory, [B, memory].
 
         Args:
             range_: range observation, [B, 180].
@@ -38,9 +46,10 @@ class ActorStep(nn.Module):
             context: ``beta`` or the collision weight, [B, 1]; not read by an agent that is told neither.
             memory: [B, memory]; zeros at the start.
         """
-        memory = _encode(self.encoder, range_, waypoint, velocity, context if self.weighted else None, memory)
-        loc, _ = self.head(memory, None if self.head.measure is None else context)
-        return torch.tanh(loc), memory
+        weight = context if self.weighted else None
+        read, after = _encode(self.encoder, range_, waypoint, velocity, weight, memory)
+        loc, _ = self.head(read, None if self.head.measure is None else context)
+        return torch.tanh(loc), after
 
 
 class CriticStep(nn.Module):
@@ -55,10 +64,10 @@ class CriticStep(nn.Module):
 
     def __init__(self, weights: Weights, fractions: Tensor) -> None:
         super().__init__()
-        config, widths = weights.config, Widths(**weights.config.network)
+        config, network = weights.config, _network_of(weights.config)
         numbers = range(config.num_critics)
-        self.encoders = nn.ModuleList(Encoder(config.vectors, widths) for _ in numbers)
-        self.heads = nn.ModuleList(_critic_head(config, widths) for _ in numbers)
+        self.encoders = nn.ModuleList(Encoder(config.vectors, network) for _ in numbers)
+        self.heads = nn.ModuleList(_critic_head(config, network) for _ in numbers)
         self.weighted = config.context == "collision_weight"
         self.register_buffer("fractions", fractions.reshape(1, 1, -1))
         for number in numbers:
@@ -82,8 +91,8 @@ class CriticStep(nn.Module):
         values, after = [], []
         for number, (encoder, head) in enumerate(zip(self.encoders, self.heads, strict=True)):
             assert isinstance(encoder, Encoder)
-            memory = _encode(encoder, range_, waypoint, velocity, given, memories[number])
-            after.append(memory)
+            memory, state = _encode(encoder, range_, waypoint, velocity, given, memories[number])
+            after.append(state)
             if isinstance(head, QuantileHead):
                 risk = None if head.measure is None else context.unsqueeze(1)
                 values.append(head(memory.unsqueeze(1), action.unsqueeze(1), self.fractions, risk).squeeze(1))
@@ -97,15 +106,19 @@ def measure_of(config: AgentConfig) -> RiskMeasure | None:
     return make_measure(config.measure) if config.context == "beta" else None
 
 
-def _critic_head(config: AgentConfig, widths: Widths) -> nn.Module:
+def _network_of(config: AgentConfig) -> NetworkSettings:
+    return NetworkSettings(padding=config.padding, **config.network)  # type: ignore[arg-type]
+
+
+def _critic_head(config: AgentConfig, network: NetworkSettings) -> nn.Module:
     if config.critic == "scalar":
-        return ScalarHead(ACTION_SIZE, widths)
-    return QuantileHead(ACTION_SIZE, widths, measure_of(config))
+        return ScalarHead(ACTION_SIZE, network)
+    return QuantileHead(ACTION_SIZE, network, measure_of(config))
 
 
 def _encode(
-    encoder: Encoder, range_: Tensor, waypoint: Tensor, velocity: Tensor, weight: Tensor | None, memory: Tensor
-) -> Tensor:
+    encoder: HistoryEncoder, range_: Tensor, waypoint: Tensor, velocity: Tensor, weight: Tensor | None, memory: Tensor
+) -> tuple[Tensor, Tensor]:
     vectors = (waypoint, velocity) if weight is None else (waypoint, velocity, weight)
     is_first = torch.zeros(len(range_), 1, dtype=torch.bool)
     return encoder.step(range_, *vectors, is_first, memory)

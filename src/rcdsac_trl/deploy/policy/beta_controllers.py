@@ -3,25 +3,15 @@ r"""Controllers that turn beta while an agent drives: bolder where there is room
 Each is called once in every control period, *before* :meth:`rcdsac_trl.deploy.Policy.act`, with what the sensor says
 now and the quantiles of the command before, and returns the beta to drive with. A smaller beta is more averse, so
 ``low`` is the most careful one that a controller uses, and ``high`` the boldest.
-
-Public names::
-
-    BetaController                                      reset(), (distances_m, quantiles) -> beta
-    FixedBeta(beta)
-    ClearanceBeta(low, high, near_m=0.4, far_m=1.2, sensor="full")
-    TailVarianceBeta(low, high, window_steps=200)
-    BanditBeta(betas, rng, step_size=0.05, exploration=0.1)     .learn(episode_return)
-    lower_tail_variance(quantiles) -> float
 """
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, sensor_mask
 
 Array = NDArray[np.floating]
 
@@ -70,7 +60,7 @@ class ClearanceBeta:
         sensor: which sectors count, those that the agent sees.
 
     Raises:
-        UserInputError: unless low is at most high, and near_m below far_m and above 0.
+        UserInputError: unless low is at most high, and near_m below far_m, above 0 and within 3 m.
 
     Example:
         >>> controller = ClearanceBeta(-2.0, 0.0, near_m=0.4, far_m=1.2)
@@ -84,6 +74,8 @@ class ClearanceBeta:
         _check_range(low, high)
         if not 0.0 < near_m < far_m:
             raise UserInputError(f"near_m={near_m:g} and far_m={far_m:g} must be above 0, and near_m below far_m")
+        if near_m > MAX_RANGE_M:
+            raise UserInputError(f"near_m={near_m:g} is beyond the {MAX_RANGE_M:g} m that agents see: give metres")
         self._betas = low, high
         self._limits_m = near_m, far_m
         self._mask = sensor_mask(sensor)
@@ -165,81 +157,6 @@ class TailVarianceBeta:
             shorter, equal = np.count_nonzero(known < tail), np.count_nonzero(known == tail)
             share = float(shorter + 0.5 * equal) / len(known)
         return self._high - share * (self._high - self._low)
-
-
-class BanditBeta:
-    r"""One beta an episode, of a few, which learns from the returns of its episodes which one pays.
-
-    The exponentially weighted forecaster of Exp3 (Auer, Cesa-Bianchi, Freund and Schapire, 2002) with returns
-    relative to those before, as Moskovitz, Parker-Holder, Pacchiano, Arbel and Jordan (2021), *Tactical Optimism and
-    Pessimism for Deep Reinforcement Learning*, turn optimism: beta k is drawn with probability
-
-    .. math:: p_k = (1 - \gamma) \frac{e^{\eta S_k}}{\sum_j e^{\eta S_j}} + \frac{\gamma}{K},
-
-    and after its episode :math:`S_k` grows by :math:`f / p_k`, where f says how many standard deviations the return
-    lies above the mean of all before, within [-1, 1].
-
-    Args:
-        betas: those to choose from.
-        rng: of the draws.
-        step_size: :math:`\eta`.
-        exploration: :math:`\gamma`, the share of episodes whose beta is drawn evenly.
-
-    Attributes:
-        betas: those to choose from.
-        beta: of this episode.
-
-    Raises:
-        UserInputError: for fewer than two betas, a step size not above 0, or a share outside [0, 1].
-    """
-
-    def __init__(
-        self,
-        betas: Sequence[float],
-        rng: np.random.Generator,
-        *,
-        step_size: float = 0.05,
-        exploration: float = 0.1,
-    ) -> None:
-        if len(betas) < 2:
-            raise UserInputError("a bandit chooses among betas: give it two or more")
-        if step_size <= 0 or not 0.0 <= exploration <= 1.0:
-            raise UserInputError(
-                f"step_size={step_size:g} must be above 0, and exploration={exploration:g} from 0 to 1: change them"
-            )
-        self.betas = tuple(betas)
-        self._rng = rng
-        self._step_size = step_size
-        self._exploration = exploration
-        self._scores = np.zeros(len(betas))
-        self._returns: list[float] = []
-        self._drawn = 0
-        self.beta = self.betas[0]
-        self.reset()
-
-    @property
-    def probabilities(self) -> NDArray[np.float64]:
-        """With which each beta is drawn, [K]."""
-        exponents = self._step_size * self._scores
-        weights = np.exp(exponents - exponents.max())
-        share: NDArray[np.float64] = weights / weights.sum()
-        return (1.0 - self._exploration) * share + self._exploration / len(share)
-
-    def reset(self) -> None:
-        """Begin an episode: draw its beta."""
-        self._drawn = int(self._rng.choice(len(self.betas), p=self.probabilities))
-        self.beta = self.betas[self._drawn]
-
-    def learn(self, episode_return: float) -> None:
-        """Take in what the episode earned."""
-        if len(self._returns) > 1 and (spread := float(np.std(self._returns))) > 0:
-            better = np.clip((episode_return - np.mean(self._returns)) / spread, -1.0, 1.0)
-            self._scores[self._drawn] += better / self.probabilities[self._drawn]
-        self._returns.append(episode_return)
-
-    def __call__(self, distances_m: Array, quantiles: Array | None) -> float:
-        """Return the beta of the episode."""
-        return self.beta
 
 
 def _check_range(low: float, high: float) -> None:

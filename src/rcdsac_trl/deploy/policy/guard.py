@@ -33,6 +33,15 @@ _LEAST_M = 0.01
 # Half the angle ahead (or behind) in which something must be sensed at all before the robot moves that way.
 _WAY_RAD = math.radians(30.0)
 
+# Limits beyond these are in another unit (mm/s, degrees/s, mm, ms), and would limit nothing or stop everything.
+_LARGEST = {
+    "max_speed_m_per_s": 2.0,
+    "max_reverse_m_per_s": 2.0,
+    "max_turn_rad_per_s": 2.0 * math.pi,
+    "radius_m": 2.0,
+    "margin_m": 2.0,
+    "reaction_s": 5.0,
+}
 # Below, the robot stands.
 _STANDS_M_PER_S = 1e-9
 _TWICE_BRAKING = 2.0 * MAX_LINEAR_ACCELERATION
@@ -61,7 +70,7 @@ class Guard:
         blind_reverse: whether the robot may drive backwards (or forwards) where it senses nothing at all.
 
     Raises:
-        UserInputError: if a limit is negative, or the radius is not positive.
+        UserInputError: if a limit is negative, the radius is not positive, or one is too large for its unit.
 
     Example:
         >>> wall = Sectors(np.full(NUM_BINS, 0.31), np.ones(NUM_BINS, dtype=bool))
@@ -84,6 +93,11 @@ class Guard:
                 raise UserInputError(f"{name}={getattr(self, name)} of the guard must be a number of 0 or more")
         if not 0.0 < self.radius_m < math.inf:
             raise UserInputError(f"radius_m={self.radius_m} of the guard must be a positive number of metres")
+        for name, largest in _LARGEST.items():
+            if getattr(self, name) > largest:
+                raise UserInputError(
+                    f"{name}={getattr(self, name):g} of the guard is above {largest:.3g}: give metres, seconds, radians"
+                )
 
     def limit(
         self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float] = (0.0, 0.0)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.ring import RING_ENDS, Padding
 
 Array = NDArray[np.float32]
 Tensors = Mapping[str, Array]
@@ -30,16 +31,17 @@ class Encoders:
     Args:
         parts: tensors of each ``rcdsac_trl.agent.networks.Encoder``, by name; all of one shape.
         mask: the bins that the sensor has, bool [180]; the others are always 0.
+        padding: how the convolutions read the ring of bins; see :mod:`rcdsac_trl.robot.ring`.
     """
 
-    def __init__(self, parts: Sequence[Tensors], mask: NDArray[np.bool_]) -> None:
+    def __init__(self, parts: Sequence[Tensors], mask: NDArray[np.bool_], padding: Padding) -> None:
         self.number, self.size = len(parts), parts[0]["gru.weight_hh_l0"].shape[1]
-        self._convolve(parts)
-        self._listen(parts, mask)
+        self._convolve(parts, RING_ENDS[padding])
+        self._select(parts, mask)
         self._vectors = _side_by_side(parts)
         self._gates = _recurrence(parts)
 
-    def _convolve(self, parts: Sequence[Tensors]) -> None:
+    def _convolve(self, parts: Sequence[Tensors], ends: tuple[int, int]) -> None:
         """Lay out the convolutions as products with all that one position reads, [E, tap * channel, channel]."""
         convolutions = [_stacked(parts, f"range.conv_{number}.weight") for number in (1, 2)]
         self._convolutions = [
@@ -47,20 +49,22 @@ class Encoders:
             for weight, bias in zip(convolutions, ("range.conv_1.bias", "range.conv_2.bias"), strict=True)
         ]
         taps_1, taps_2 = (weight.shape[3] for weight in convolutions)
-        self._windows = _windows(NUM_BINS, taps_1), _windows((NUM_BINS - taps_1) // 2 + 1, taps_2)
+        before, read = ends[0], NUM_BINS + sum(ends)
+        windows = (_windows(read, taps_1) - before) % NUM_BINS, _windows((read - taps_1) // 2 + 1, taps_2)
+        self._windows: tuple[NDArray[np.intp], NDArray[np.intp]] = windows
 
-    def _listen(self, parts: Sequence[Tensors], mask: NDArray[np.bool_]) -> None:
+    def _select(self, parts: Sequence[Tensors], mask: NDArray[np.bool_]) -> None:
         """Keep of the positions those that see a bin of the sensor: the others say the same at every step."""
         all_1, all_2 = self._windows
-        hears: NDArray[np.bool_] = np.any(mask[all_1], axis=1)
-        live: NDArray[np.bool_] = np.any(hears[all_2], axis=1)
-        silent = self._positions(np.zeros(NUM_BINS, dtype=np.float32)) * ~live[:, None]
+        sees: NDArray[np.bool_] = np.any(mask[all_1], axis=1)
+        live: NDArray[np.bool_] = np.any(sees[all_2], axis=1)
+        inactive = self._positions(np.zeros(NUM_BINS, dtype=np.float32)) * ~live[:, None]
         weight = _transposed(parts, "range.linear.weight")
-        constant = silent.reshape(len(parts), 1, -1) @ weight + _row(parts, "range.linear.bias")
+        constant = inactive.reshape(len(parts), 1, -1) @ weight + _row(parts, "range.linear.bias")
         needed, again = np.unique(all_2[live], return_inverse=True)
         self._windows = all_1[needed], again.reshape(-1, all_2.shape[1])
-        heard = weight.reshape(len(parts), len(live), -1, weight.shape[2])[:, live]
-        self._linear = heard.reshape(len(parts), -1, weight.shape[2]), constant
+        active = weight.reshape(len(parts), len(live), -1, weight.shape[2])[:, live]
+        self._linear = active.reshape(len(parts), -1, weight.shape[2]), constant
 
     def step(self, bins: Array, vectors: Array, memories: Array) -> Array:
         """Return the next memories [E, memory].

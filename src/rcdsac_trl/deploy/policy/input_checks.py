@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors
+from rcdsac_trl.deploy.sensors.arrays import masked, numbers_of
+from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, zero_readings
 from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MIN_RANGE_M, WAYPOINT_DISTANCE_LIMITS_M
@@ -17,13 +18,22 @@ from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
 _FASTEST_M_PER_S = 2.0
 _FASTEST_RAD_PER_S = 2.0 * math.pi
 _FARTHEST_RANGE_M = 200.0
+# Something is nearer than this wherever a robot of this kind drives; else distances are in cm, or mm.
+_NEAREST_RANGE_M = 20.0
 _EVERYWHERE = np.ones(NUM_BINS, dtype=np.bool_)
 _EVERYWHERE.flags.writeable = False
 # Clocks of two computers differ a little.
 _CLOCK_SLACK_S = 0.05
+# A clock that counts seconds gets there in the year 5138; one that counts milliseconds since 1970 did in 1973.
+_LAST_STAMP_S = 1e11
+# Stamps that count in larger steps cannot tell one period from the next.
+_COARSEST_STAMP_S = 0.01
+# So far apart are clocks that have nothing to do with each other.
+_OTHER_CLOCK_S = 60.0
+_LARGEST_AGE_S = 10.0
 
 
-class BadInputError(Exception):
+class BadInputError(UserInputError):
     """Input that nobody should drive on; the message says what is wrong with it."""
 
 
@@ -60,6 +70,8 @@ class InputLimits:
         """Refuse what is no limit."""
         if not 0.0 < self.max_age_s < math.inf:
             raise UserInputError(f"max_age_s={self.max_age_s} must be a positive number of seconds")
+        if self.max_age_s > _LARGEST_AGE_S:
+            raise UserInputError(f"max_age_s={self.max_age_s:g} is above {_LARGEST_AGE_S:g}: give seconds")
         if not 0.0 <= self.max_lost_share < 1.0:
             raise UserInputError(f"max_lost_share={self.max_lost_share} is a share: give 0 or more, and less than 1")
 
@@ -74,13 +86,37 @@ def check_stamps(stamps: Stamps, last: Stamps | None, limits: InputLimits) -> No
     for name in ("now_s", "scan_s", "waypoints_s", "velocity_s"):
         stamp = getattr(stamps, name)
         if not is_finite_number(stamp):
-            raise BadInputError(f"stamp {name} is no finite number")
+            raise BadInputError(f"stamp {name} is no finite number: give seconds")
+        _check_seconds(name, stamp)
         if last is not None and stamp < getattr(last, name):
             raise BadInputError(f"stamp {name} goes back by {getattr(last, name) - stamp:.2f} s")
         if stamp > now + _CLOCK_SLACK_S:
-            raise BadInputError(f"stamp {name} is {stamp - now:.2f} s in the future")
+            raise BadInputError(f"stamp {name} is {stamp - now:.2f} s in the future{_other_clock(stamp, now)}")
         if now - stamp > limits.max_age_s:
-            raise BadInputError(f"stamp {name} is {now - stamp:.2f} s old, more than {limits.max_age_s:g} s")
+            raise BadInputError(
+                f"stamp {name} is {now - stamp:.2f} s old, more than {limits.max_age_s:g} s{_other_clock(stamp, now)}"
+            )
+
+
+def _check_seconds(name: str, stamp: Any) -> None:
+    """Refuse a stamp that counts something else than seconds, or too coarsely."""
+    if abs(stamp) > _LAST_STAMP_S:
+        raise BadInputError(
+            f"stamp {name}={float(stamp):g} is above {_LAST_STAMP_S:g}, so not in seconds: nanoseconds times 1e-9 are"
+        )
+    if isinstance(stamp, np.floating) and np.spacing(stamp) > _COARSEST_STAMP_S:
+        raise BadInputError(
+            f"stamp {name} is {stamp.dtype}, which counts in steps of {float(np.spacing(stamp)):g} s: give float64"
+        )
+
+
+def _other_clock(stamp: float, now: float) -> str:
+    """Return what may be wrong with a stamp that is far from now."""
+    if stamp == 0.0:
+        return ": 0 is what messages hold that nobody stamped"
+    return (
+        "" if abs(now - stamp) < _OTHER_CLOCK_S else ": are both in seconds, of one clock (simulated time, wall time)?"
+    )
 
 
 def sectors_of(ranges: Any, mask: NDArray[np.bool_], limits: InputLimits) -> Sectors:
@@ -94,45 +130,74 @@ def sectors_of(ranges: Any, mask: NDArray[np.bool_], limits: InputLimits) -> Sec
     Raises:
         BadInputError: if it may not.
     """
-    if isinstance(ranges, Scan):
-        try:
-            ranges = scan_sectors(ranges)
-        except UserInputError as error:
-            raise BadInputError(str(error)) from error
+    scan = ranges if isinstance(ranges, Scan) else None
+    if scan is not None:
+        ranges = scan_sectors(scan)
     covered = _EVERYWHERE
     if isinstance(ranges, Sectors):
-        covered = _array(ranges.covered, (NUM_BINS,), "covered").astype(np.bool_)
-        ranges = ranges.distances_m
+        covered, ranges = _covered(ranges), ranges.distances_m
+    if (unknown := masked(ranges)) is not None and unknown.shape == covered.shape:
+        covered = covered & ~unknown
     distances = _array(ranges, (NUM_BINS,), "ranges")
     _check_ranges(distances if covered is _EVERYWHERE else distances[covered])
     if covered is not _EVERYWHERE:
-        _check_lost(mask, covered, limits)
+        _check_lost(mask, covered, limits, scan)
     return Sectors(np.where(covered & (distances < MAX_RANGE_M), distances, math.inf), covered)
 
 
+def _covered(sectors: Sectors) -> NDArray[np.bool_]:
+    """Return which sectors are measured, [180]."""
+    covered = sectors.covered
+    if isinstance(covered, np.ma.MaskedArray):
+        covered = covered.filled(False)
+    covered = np.asarray(covered)
+    if covered.dtype != np.bool_ or covered.shape != (NUM_BINS,):
+        raise BadInputError(
+            f"covered is {covered.dtype} {list(covered.shape)}: say for each sector whether it was measured, bool "
+            f"[{NUM_BINS}]"
+        )
+    return covered
+
+
 def _check_ranges(known: NDArray[np.float64]) -> None:
-    """Refuse measured ranges, [n], if one of them is none."""
+    """Refuse measured ranges, [n], if one of them is none, or all are in another unit."""
     # Counting is the cheapest way to look at all of them; NaN is not above anything.
     above = np.count_nonzero(known > MIN_RANGE_M) == len(known)
     if above and np.count_nonzero(known > _FARTHEST_RANGE_M) == np.count_nonzero(known == math.inf):
-        return
+        near = np.count_nonzero(known < _NEAREST_RANGE_M)
+        if near or np.count_nonzero(known == math.inf) == len(known):
+            return
+        raise BadInputError(
+            f"no range is below {_NEAREST_RANGE_M:g} m, the smallest is {known.min():g}: give metres, and inf where "
+            "nothing is"
+        )
     if np.isnan(known).any():
         raise BadInputError("ranges hold NaN: mark what is not measured as not covered (Sectors), or pass the Scan")
     if not above:
         raise BadInputError(
             f"ranges go down to {known.min():g} m, below {MIN_RANGE_M:g} m is no measurement: inf means nothing there"
         )
-    raise BadInputError(f"a range of {known[np.isfinite(known)].max():g} is not in metres: inf means nothing there")
+    raise BadInputError(
+        f"a range of {known[np.isfinite(known)].max():g} is above {_FARTHEST_RANGE_M:g}, so not in metres: inf means "
+        "nothing there"
+    )
 
 
-def _check_lost(mask: NDArray[np.bool_], covered: NDArray[np.bool_], limits: InputLimits) -> None:
+def _check_lost(mask: NDArray[np.bool_], covered: NDArray[np.bool_], limits: InputLimits, scan: Scan | None) -> None:
     """Refuse a sensor that says too little about the agent's range bins."""
     lost = np.count_nonzero(mask & ~covered) / np.count_nonzero(mask)
-    if lost > limits.max_lost_share:
-        raise BadInputError(
-            f"{100 * lost:.0f} % of the range bins this agent sees are not measured, more than "
-            f"{100 * limits.max_lost_share:g} %: is the sensor blind, or of another kind?"
+    if lost <= limits.max_lost_share:
+        return
+    why = "is the sensor blind, or of another kind?"
+    if scan is not None and (zeros := zero_readings(scan)):
+        why = (
+            f"{zeros} of {np.size(scan.ranges)} rays read 0; if the driver writes 0 where nothing is, set "
+            "zero_means='nothing'"
         )
+    raise BadInputError(
+        f"{100 * lost:.0f} % of the range bins this agent sees are not measured, more than "
+        f"{100 * limits.max_lost_share:g} %: {why}"
+    )
 
 
 def waypoints_of(waypoints: Any) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -148,7 +213,7 @@ def waypoints_of(waypoints: Any) -> tuple[tuple[float, float], tuple[float, floa
         raise BadInputError(f"waypoints have shape {list(array.shape)}: give x and y of the next two, [2, 2]")
     (x_1, y_1), (x_2, y_2) = array.tolist()
     if not all(math.isfinite(value) for value in (x_1, y_1, x_2, y_2)):
-        raise BadInputError("waypoints are not all finite numbers")
+        raise BadInputError("waypoints are not all finite numbers: give x and y in metres")
     farthest = max(abs(x_1), abs(y_1), abs(x_2), abs(y_2))
     if farthest > WAYPOINT_DISTANCE_LIMITS_M[1]:
         raise BadInputError(
@@ -166,20 +231,17 @@ def velocity_of(velocity: Any) -> tuple[float, float]:
     """
     v, omega = _array(velocity, (2,), "velocity").tolist()
     if not (math.isfinite(v) and math.isfinite(omega)):
-        raise BadInputError("velocity is not finite")
+        raise BadInputError("velocity is not finite: give measured m/s and rad/s")
     if abs(v) > _FASTEST_M_PER_S or abs(omega) > _FASTEST_RAD_PER_S:
-        raise BadInputError(f"velocity ({v:g}, {omega:g}) is not in m/s and rad/s")
+        raise BadInputError(
+            f"velocity ({v:g}, {omega:g}) is not in m/s and rad/s: no robot of this kind exceeds "
+            f"{_FASTEST_M_PER_S:g} m/s or {_FASTEST_RAD_PER_S:.2f} rad/s"
+        )
     return v, omega
 
 
 def _array(value: Any, shape: tuple[int, ...] | None, name: str) -> NDArray[np.float64]:
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind not in "fiub":
-            raise BadInputError(f"{name} are not numbers")
-        array = array.astype(np.float64, copy=False)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise BadInputError(f"{name} are not numbers") from error
+    array = numbers_of(value, name)
     if shape is not None and array.shape != shape:
         raise BadInputError(f"{name} have shape {list(array.shape)}: give {list(shape)}")
     return array

@@ -18,6 +18,7 @@ from rcdsac_trl.deploy.policy.input_checks import (
     waypoints_of,
 )
 from rcdsac_trl.deploy.policy.weights import Weights
+from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
 from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
@@ -79,7 +80,9 @@ class Policy:
         self._default_weight = middle if self.config.context == "collision_weight" else None
         self._mask = sensor_mask(self.config.sensor)
         parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
-        self._encoders = Encoders([weights.part(f"{part}.encoder") for part in parts], self._mask)
+        self._encoders = Encoders(
+            [weights.part(f"{part}.encoder") for part in parts], self._mask, weights.config.padding
+        )
         self._actor = Actor(weights)
         self._critics = Critics(weights, self.fractions)
         self._halted = False
@@ -112,9 +115,11 @@ class Policy:
                 part of its memory, `beta` is refused by :meth:`act`, too, or `action` is no action.
 
         Example:
-            >>> policy = Policy(weights)  # doctest: +SKIP
-            >>> policy.act(ranges, waypoints, velocity, beta=0.0)  # doctest: +SKIP
-            >>> policy.foresee(-2.0).wanted  # doctest: +SKIP
+            >>> import rcdsac_trl
+            >>> policy = rcdsac_trl.load("rcdsac_pow-narrow")
+            >>> bold = policy.act(np.full(180, np.inf), [(2.0, 0.0), (3.0, 1.0)], (0.0, 0.0), beta=0.0).wanted
+            >>> policy.foresee(0.0).wanted == bold, policy.foresee(-2.0).wanted == bold
+            (True, False)
         """
         if self._steps == 0:
             raise UserInputError("nothing was seen since the memory was cleared: call act() first")
@@ -125,7 +130,7 @@ class Policy:
         embedded = self._embedded(self.check_beta(beta))
         if action is None:
             return self._outlook(embedded)
-        asked = np.asarray(action, dtype=np.float32)
+        asked = numbers_of(action, "action").astype(np.float32)
         if asked.shape != (2,) or not np.all(np.abs(asked) <= 1.0):
             raise UserInputError(f"action={action} is not two numbers from -1 to 1: give u_0 and u_1")
         return self._outlook(embedded, asked)
@@ -173,25 +178,26 @@ class Policy:
         try:
             if self._halted:
                 raise BadInputError("stop() was called")
-            return self._drive(ranges, waypoints, velocity, beta, collision_weight, stamps)
-        except BadInputError as error:
+            if stamps is not None:
+                check_stamps(stamps, self._last, self.limits)
+            sectors = sectors_of(ranges, self._mask, self.limits)
+            next_two = waypoints_of(waypoints)
+            measured = velocity_of(velocity)
+            context = self._context(beta, collision_weight)
+        except UserInputError as error:
             return self.refuse(str(error))
+        except Exception as error:  # whatever was given: what it does when it is read is not ours to know
+            return self.refuse(f"the input cannot be read ({described(error)})")
+        return self._drive(sectors, next_two, measured, context, stamps)
 
     def _drive(
         self,
-        ranges: Any,
-        waypoints: Any,
-        velocity: Any,
-        beta: float | None,
-        collision_weight: float | None,
+        sectors: Sectors,
+        next_two: tuple[tuple[float, float], tuple[float, float]],
+        measured: tuple[float, float],
+        context: float | None,
         stamps: Stamps | None,
     ) -> Command:
-        if stamps is not None:
-            check_stamps(stamps, self._last, self.limits)
-        sectors = sectors_of(ranges, self._mask, self.limits)
-        next_two = waypoints_of(waypoints)
-        measured = velocity_of(velocity)
-        context = self._context(beta, collision_weight)
         fresh = self._is_due(stamps)
         self._refused = 0
         self._last = stamps
@@ -274,7 +280,7 @@ class Policy:
         given = {"beta": beta, "collision_weight": collision_weight}
         for name, value in given.items():
             if value is not None and not is_finite_number(value):
-                raise BadInputError(f"{name} is no finite number")
+                raise BadInputError(f"{name} is no finite number ({type(value).__name__}): give one, as a float")
             if value is None or name == config.context or (name == "beta" and value == config.fixed_beta):
                 continue
             raise BadInputError(f"{name}={value:g} means nothing to this agent ({config.name}): leave it out")

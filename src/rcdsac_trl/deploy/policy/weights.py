@@ -23,8 +23,10 @@ from safetensors.numpy import save as save_tensors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS
+from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""What is written. Format 1, which is read as well, does not say how its agents read the ring: without padding."""
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "weights.safetensors"
 CARD_NAME = "README.md"
@@ -35,6 +37,8 @@ Context = Literal["beta", "collision_weight"]
 
 _WIDTHS = ("conv", "range", "vector", "memory", "head", "cosines")
 _ACTION_SIZE = 2
+# Beyond these, a file holds milliseconds and millimetres.
+_LONGEST_PERIOD_S, _LARGEST_RADIUS_M = 10.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class AgentConfig:
         waypoint_radius_m: a waypoint nearer than this gives way to the next.
         goal_radius_m: a goal nearer than this is reached.
         provenance: where it comes from, for people: run, commit, checkpoint, steps.
+        padding: how its convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
 
     Raises:
         UserInputError: if values do not fit together.
@@ -75,6 +80,7 @@ class AgentConfig:
     waypoint_radius_m: float
     goal_radius_m: float
     provenance: Mapping[str, str | int | float | None]
+    padding: Padding = "circular"
 
     def __post_init__(self) -> None:
         """Refuse what no agent can be."""
@@ -86,12 +92,23 @@ class AgentConfig:
             if len(pair) != 2 or not all(math.isfinite(number) for number in pair):
                 raise UserInputError(f"{name}={value} is not two finite numbers")
             object.__setattr__(self, name, pair)
+        if not 0.0 <= self.period_s[0] <= self.period_s[1] <= _LONGEST_PERIOD_S:
+            raise UserInputError(
+                f"period_s={self.period_s} does not rise within [0, {_LONGEST_PERIOD_S:g}]: give seconds"
+            )
+        for name in ("waypoint_radius_m", "goal_radius_m"):
+            if not 0.0 < getattr(self, name) <= _LARGEST_RADIUS_M:
+                raise UserInputError(
+                    f"{name}={getattr(self, name)} is not above 0 and at most {_LARGEST_RADIUS_M:g}: give metres"
+                )
         if self.sensor not in SENSORS:
             raise UserInputError(f"sensor={self.sensor!r} does not exist; choose one of {', '.join(sorted(SENSORS))}")
         if self.critic not in ("quantile", "scalar"):
             raise UserInputError(f"critic={self.critic!r} is neither 'quantile' nor 'scalar'")
         if set(self.network) != set(_WIDTHS) or not all(type(w) is int and w >= 1 for w in self.network.values()):
             raise UserInputError(f"network={dict(self.network)} does not give a positive width for each of {_WIDTHS}")
+        if self.padding not in RING_ENDS:
+            raise UserInputError(f"padding={self.padding!r} is neither 'circular' nor 'none'")
         if type(self.num_critics) is not int or self.num_critics < 1:
             raise UserInputError(f"num_critics={self.num_critics} is no positive number")
         if self.context not in ("beta", "collision_weight", None):
@@ -114,14 +131,13 @@ class AgentConfig:
 
     def _encoder(self) -> dict[str, tuple[int, ...]]:
         n = self.network
-        positions = ((NUM_BINS - 5) // 2 + 1 - 3) // 2 + 1  # behind two convolutions of stride 2
         inputs = n["range"] + n["vector"] * len(self.vectors)
         shapes: dict[str, tuple[int, ...]] = {
-            "range.conv_1.weight": (n["conv"], 1, 5),
+            "range.conv_1.weight": (n["conv"], 1, KERNELS[0]),
             "range.conv_1.bias": (n["conv"],),
         }
-        shapes |= {"range.conv_2.weight": (n["conv"], n["conv"], 3), "range.conv_2.bias": (n["conv"],)}
-        shapes |= _linear("range.linear", positions * n["conv"], n["range"])
+        shapes |= {"range.conv_2.weight": (n["conv"], n["conv"], KERNELS[1]), "range.conv_2.bias": (n["conv"],)}
+        shapes |= _linear("range.linear", num_positions(self.padding) * n["conv"], n["range"])
         for index, size in enumerate(self.vectors.values()):
             shapes |= _linear(f"vectors.{index}", size, n["vector"])
         for side, size in (("ih", inputs), ("hh", n["memory"])):
@@ -175,6 +191,10 @@ class Weights:
                 raise UserInputError(f"{name} holds numbers that are not finite: this agent cannot drive")
         object.__setattr__(self, "tensors", MappingProxyType(dict(self.tensors)))
 
+    def __reduce__(self) -> tuple[type["Weights"], tuple[AgentConfig, dict[str, NDArray[np.float32]]]]:
+        """Pickle and copy what the views of mappings are of: they themselves cannot be."""
+        return Weights, (self.config, dict(self.tensors))
+
     def part(self, prefix: str) -> dict[str, NDArray[np.float32]]:
         """Return the tensors below a prefix, such as ``"actor.encoder"``, without it."""
         return {name[len(prefix) + 1 :]: value for name, value in self.tensors.items() if name.startswith(f"{prefix}.")}
@@ -218,10 +238,14 @@ def read_weights(folder: Path) -> Weights:
         version, digest = values.pop("format_version"), values.pop("weights_sha256")
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise UserInputError(f"{path} cannot be read ({type(error).__name__}): export the agent anew") from error
-    if version != FORMAT_VERSION:
-        raise UserInputError(f"{folder} is of format {version}, this version reads {FORMAT_VERSION}: export it anew")
-    if set(values) != {field.name for field in fields(AgentConfig)}:
-        raise UserInputError(f"{path} does not have the keys of format {FORMAT_VERSION}: export the agent anew")
+    if version not in (1, FORMAT_VERSION):
+        raise UserInputError(
+            f"{folder} is of format {version}, this version reads 1 and {FORMAT_VERSION}: export it anew"
+        )
+    if set(values) != {field.name for field in fields(AgentConfig)} - ({"padding"} if version == 1 else set()):
+        raise UserInputError(f"{path} does not have the keys of format {version}: export the agent anew")
+    if version == 1:
+        values["padding"] = "none"
     try:
         content = (folder / WEIGHTS_NAME).read_bytes()
     except OSError as error:

@@ -9,7 +9,8 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
-from cyclonedds.core import DDSException, Policy, Qos
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -20,7 +21,8 @@ from cyclonedds.util import duration
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros import dds_types
-from rcdsac_trl.deploy.ros.messages import twist_stamped
+from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
+from rcdsac_trl.deploy.ros.topics import readers_of, writers_of
 from rcdsac_trl.errors import UserInputError
 
 READS: dict[str, Any] = {
@@ -32,11 +34,16 @@ READS: dict[str, Any] = {
 }
 """Topics that are read, and their types."""
 WRITES: dict[str, Any] = {"cmd_vel": dds_types.TwistStamped, "return_quantiles": dds_types.Float32MultiArray}
-"""Topics that are written, and their types."""
+"""Topics that are written, and their types; ``cmd_vel`` as :data:`UNSTAMPED` as well, for bases that read that."""
+UNSTAMPED: Any = dds_types.Twist
 
 # ROS's sensor data: readers that ask for less than writers offer meet all of them.
 _SENSORS = {"scan", "odom"}
 _TOPIC = re.compile(r"/?([A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*)")
+# Without a message on these the robot stands.
+_NEEDED = ("scan", "odom", "plan")
+_MOST_ENDPOINTS = 1000
+_TYPE = re.compile(r"(\w+)::(\w+)::dds_::(\w+)_")
 # The samples that one reader may hold: the newest message, and word that its writer has left.
 _MOST_SAMPLES = 8
 _ACKNOWLEDGED_WITHIN = duration(seconds=1)
@@ -79,6 +86,15 @@ class DdsBridge:
             name: DataWriter(participant, self._topic(participant, name, kind), _qos(reliable=True))
             for name, kind in WRITES.items()
         }
+        self._unstamped = DataWriter(participant, self._topic(participant, "cmd_vel", UNSTAMPED), _qos(reliable=True))
+        self._found = {
+            "writers": BuiltinDataReader(participant, BuiltinTopicDcpsPublication),
+            "readers": BuiltinDataReader(participant, BuiltinTopicDcpsSubscription),
+        }
+        self._present = {
+            who: ReadCondition(found, SampleState.Any | ViewState.Any | InstanceState.Alive)
+            for who, found in self._found.items()
+        }
 
     def _topic(self, participant: DomainParticipant, name: str, kind: Any) -> Any:
         return Topic(participant, f"rt/{self.topics[name]}", kind)
@@ -97,7 +113,23 @@ class DdsBridge:
     def leave(self, now_s: float) -> None:
         """Publish the command to stand, and wait until readers that can tell have got it, at most 1 s."""
         self._say(self.driver.policy.refuse("the node leaves"), now_s)
-        self._writers["cmd_vel"].wait_for_acks(_ACKNOWLEDGED_WITHIN)
+        for writer in (self._writers["cmd_vel"], self._unstamped):
+            writer.wait_for_acks(_ACKNOWLEDGED_WITHIN)
+
+    def report(self) -> str:
+        """Return who reads the commands, as which type, and which of the needed topics nobody writes as it is read."""
+        commands = [_type_name(kind) for kind in (WRITES["cmd_vel"], UNSTAMPED)]
+        said = [readers_of(f"/{self.topics['cmd_vel']}", commands, self._types("cmd_vel", "readers"))]
+        for name in _NEEDED:
+            kind, writers = _type_name(READS[name]), self._types(name, "writers")
+            matched = bool(self._readers[name].get_matched_publications())
+            said.append(writers_of(f"/{self.topics[name]}", kind, writers, matched=matched) or "")
+        return "; ".join(filter(None, said))
+
+    def _types(self, name: str, who: str) -> list[str]:
+        """Return the type of each writer, or reader, of a topic that DDS has found and that has not left."""
+        endpoints = self._found[who].read(_MOST_ENDPOINTS, condition=self._present[who])
+        return [_ros_name(found.type_name) for found in endpoints if found.topic_name == f"rt/{self.topics[name]}"]
 
     def _listen(self) -> None:
         driver = self.driver
@@ -121,6 +153,7 @@ class DdsBridge:
 
     def _say(self, command: Command, now_s: float) -> None:
         self._writers["cmd_vel"].write(twist_stamped(command, now_s, _made))
+        self._unstamped.write(twist(command, _made))
         if command.quantiles is not None:
             quantiles = dds_types.Float32MultiArray(data=command.quantiles.tolist())
             self._writers["return_quantiles"].write(quantiles)
@@ -163,6 +196,17 @@ def _topics(remapped: Mapping[str, str]) -> dict[str, str]:
         if others := [other for other in names if other != name and topics[other] == topic]:
             raise UserInputError(f"{name} and {others[0]} are both called /{topic}: give each a topic of its own")
     return topics
+
+
+def _type_name(kind: Any) -> str:
+    """Return what ROS calls a message type."""
+    return _ros_name(kind.__idl__.idl_transformed_typename)
+
+
+def _ros_name(type_name: str) -> str:
+    """Return what ROS calls a type of DDS, such as ``"geometry_msgs/msg/Twist"``, or the name itself."""
+    match = _TYPE.fullmatch(type_name)
+    return "/".join(match.groups()) if match else type_name
 
 
 def _made(name: str) -> Any:

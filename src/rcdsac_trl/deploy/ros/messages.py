@@ -11,36 +11,66 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.policy.policy import Command
-from rcdsac_trl.deploy.sensors.scan import Scan
-from rcdsac_trl.deploy.sensors.sectors import Mount
+from rcdsac_trl.deploy.policy.command import Command
+from rcdsac_trl.deploy.sensors.arrays import numbers_of
+from rcdsac_trl.deploy.sensors.scan import Scan, ZeroMeans
+from rcdsac_trl.deploy.sensors.sectors import Mount, is_finite_number
 from rcdsac_trl.errors import UserInputError
 
+# Drivers count the last angle to the last ray or to the one after it; more is another unit, or number of rays.
+_ANGLE_SLACK_RAYS, _ANGLE_SLACK_SHARE = 2.0, 0.05
+# builtin_interfaces/Time holds whole seconds in 32 bits.
+_LAST_STAMP_S = 2.0**31
 # sensor_msgs/PointField: number of a type to NumPy's.
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def stamp_s(message: Any) -> float:
-    """Return the time in a message's header, s."""
+    """Return the time in a message's header, s.
+
+    Raises:
+        UserInputError: if it does not hold less than a second of nanoseconds.
+    """
     stamp = message.header.stamp
+    if not 0 <= stamp.nanosec < 1_000_000_000:
+        raise UserInputError(f"a stamp's nanosec={stamp.nanosec} is not from 0 to 999999999: put seconds into sec")
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
-def scan_of(message: Any, mount: Mount | None = None) -> Scan:
+def scan_of(message: Any, mount: Mount | None = None, zero_means: ZeroMeans = "unknown") -> Scan:
     """Return the scan in a ``sensor_msgs/LaserScan``.
 
     Args:
         message: the message.
         mount: where the sensor sits, from the static transform to its frame; None for the robot's centre.
+        zero_means: what its driver means by a reading of 0.
+
+    Raises:
+        UserInputError: if its ranges are no numbers, or its angles do not fit to their number.
     """
+    ranges = numbers_of(message.ranges, "the scan's ranges")
+    _check_angles(message, ranges.size)
     return Scan(
-        ranges=np.asarray(message.ranges, dtype=np.float64),
+        ranges=ranges,
         angle_min=float(message.angle_min),
         angle_increment=float(message.angle_increment),
         range_min=float(message.range_min),
         range_max=float(message.range_max),
         mount=mount or Mount(),
+        zero_means=zero_means,
     )
+
+
+def _check_angles(message: Any, rays: int) -> None:
+    """Refuse a ``LaserScan`` whose last angle is not where its rays lead: one of its fields is in another unit."""
+    first, last, increment = float(message.angle_min), float(message.angle_max), float(message.angle_increment)
+    leads_to = first + increment * (rays - 1)
+    slack = max(_ANGLE_SLACK_RAYS * abs(increment), _ANGLE_SLACK_SHARE * abs(last - first))
+    if abs(leads_to - last) > slack:
+        raise UserInputError(
+            f"the scan's {rays} rays from angle_min={first:g} in steps of angle_increment={increment:g} lead to "
+            f"{leads_to:g}, its angle_max={last:g} is elsewhere: give all three in radians, and a number for each ray"
+        )
 
 
 def points_of(message: Any) -> NDArray[np.float64]:
@@ -106,13 +136,30 @@ def twist_stamped(command: Command, now_s: float, make: Callable[[str], Any], *,
         now_s: time for the header, s.
         make: returns an empty message of the type with that name; see :func:`rosbags_maker`.
         frame_id: of the header.
+
+    Raises:
+        UserInputError: if the time is not one in seconds that a header can hold.
     """
+    if not (is_finite_number(now_s) and 0.0 <= now_s < _LAST_STAMP_S):
+        raise UserInputError(f"now_s={now_s} is not from 0 to {_LAST_STAMP_S:g}: give seconds")
     message = make("geometry_msgs/msg/TwistStamped")
     nanoseconds = round(now_s * 1e9)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
     message.header.frame_id = frame_id
-    message.twist.linear.x = command.v_m_per_s
-    message.twist.angular.z = command.omega_rad_per_s
+    message.twist = twist(command, make)
+    return message
+
+
+def twist(command: Command, make: Callable[[str], Any]) -> Any:
+    """Return a command as ``geometry_msgs/Twist``, which many bases still read.
+
+    Args:
+        command: of the policy.
+        make: as for :func:`twist_stamped`.
+    """
+    message = make("geometry_msgs/msg/Twist")
+    message.linear.x = command.v_m_per_s
+    message.angular.z = command.omega_rad_per_s
     return message
 
 

@@ -7,9 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.deploy.sensors.sectors import BIN_RAD, BODY_RADIUS_M, Sectors, bins_of, nearest_by_sector
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+
+# Farther from the robot's centre, no camera is mounted: mm, then.
+_FARTHEST_CAMERA_M = 3.0
+# Of what a camera on a robot sees, its floor if nothing else, this share at least is so near.
+_NEAR_M, _NEAR_SHARE = 20.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,11 @@ class CameraPose:
             )
         if not 0.0 < self.view_rad <= 2.0 * math.pi:
             raise UserInputError(f"view_rad={self.view_rad:g} of a camera is outside (0, 2 pi]: give radians")
+        if math.hypot(*self.position_m) > _FARTHEST_CAMERA_M:
+            raise UserInputError(
+                f"a camera at {self.position_m} is more than {_FARTHEST_CAMERA_M:g} m from the floor below the robot's "
+                "centre: give metres"
+            )
 
     @property
     def rotation(self) -> NDArray[np.float64]:
@@ -83,9 +94,14 @@ class CloudFilter:
     min_points: int = 50
 
     def __post_init__(self) -> None:
-        """Refuse an empty slice, and counts below their least."""
+        """Refuse an empty slice, counts below their least, and heights in another unit."""
         if not self.floor_m < self.ceiling_m:
             raise UserInputError(f"floor_m={self.floor_m:g} is not below ceiling_m={self.ceiling_m:g}")
+        if not (abs(self.floor_m) <= MAX_RANGE_M and self.body_radius_m <= MAX_RANGE_M):
+            raise UserInputError(
+                f"floor_m={self.floor_m:g} or body_radius_m={self.body_radius_m:g} is beyond the {MAX_RANGE_M:g} m "
+                "that agents see: give metres"
+            )
         if self.support < 1 or self.min_points < 0 or self.body_radius_m < 0.0:
             raise UserInputError(
                 f"support={self.support} must be at least 1, min_points={self.min_points} and "
@@ -101,11 +117,12 @@ def cloud_sectors(clouds: Sequence[tuple[ArrayLike, CameraPose]], filter_: Cloud
 
     Args:
         clouds: points [n, 3] or [h, w, 3] in the camera's frame, m, and the camera's pose, for each camera; points
-            that are not finite are left out.
+            that are not finite or masked are left out, and so is the camera's own place (0, 0, 0), which drivers
+            write for pixels without depth.
         filter_: which points are obstacles; None for the defaults.
 
     Raises:
-        UserInputError: if points are no [.., 3] array of numbers.
+        UserInputError: if points are no [.., 3] array of numbers, or not in metres.
 
     Example:
         >>> wall = np.stack(np.meshgrid([1.0], np.linspace(-1, 1, 99), np.linspace(0, 1, 9)), -1)
@@ -118,9 +135,12 @@ def cloud_sectors(clouds: Sequence[tuple[ArrayLike, CameraPose]], filter_: Cloud
     bins: list[NDArray[np.intp]] = []
     distances: list[NDArray[np.float64]] = []
     for points, pose in clouds:
-        finite = _finite_points(points)
+        if not isinstance(pose, CameraPose):
+            raise UserInputError(f"a cloud's pose is a {type(pose).__name__}: give a CameraPose")
+        finite = _measured_points(points)
         if len(finite) < max(filter_.min_points, 1):
             continue
+        _check_unit(finite)
         x, y, z = (finite @ pose.rotation.T + np.asarray(pose.position_m)).T
         distance = np.hypot(x, y)
         obstacle = (z >= filter_.floor_m) & (z <= filter_.ceiling_m) & (distance >= filter_.body_radius_m)
@@ -134,15 +154,23 @@ def cloud_sectors(clouds: Sequence[tuple[ArrayLike, CameraPose]], filter_: Cloud
     return Sectors(nearest, covered | np.isfinite(nearest))
 
 
-def _finite_points(points: ArrayLike) -> NDArray[np.float64]:
-    try:
-        array = np.asarray(points, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise UserInputError("a cloud's points are not numbers: give x, y and z in metres") from error
+def _measured_points(points: ArrayLike) -> NDArray[np.float64]:
+    """Return the points of a cloud at which something was measured, [n, 3]."""
+    array = numbers_of(points, "a cloud's points")
     if array.ndim < 2 or array.shape[-1] != 3:
         raise UserInputError(f"a cloud of shape {list(array.shape)} is none: give [n, 3] or [height, width, 3]")
     array = array.reshape(-1, 3)
-    return array[np.isfinite(array).all(axis=1)]
+    return array[np.isfinite(array).all(axis=1) & array.any(axis=1)]
+
+
+def _check_unit(points: NDArray[np.float64]) -> None:
+    """Refuse points, [n, 3] from the camera, that are nearly all too far away for a camera on a robot."""
+    near = np.count_nonzero((np.abs(points) < _NEAR_M).all(axis=1))
+    if near < _NEAR_SHARE * len(points):
+        raise UserInputError(
+            f"a cloud's points are {float(np.median(np.abs(points).max(axis=1))):g} m away in the median, {near} of "
+            f"{len(points)} are within {_NEAR_M:g} m: give metres"
+        )
 
 
 def _in_view(pose: CameraPose) -> NDArray[np.bool_]:

@@ -8,14 +8,19 @@ What a ray's number means (REP 117, and what drivers do in spite of it):
 | +Inf, or beyond range_max | nothing is there |
 | -Inf | something is there, nearer than range_min: it counts as range_min |
 | NaN, 0, or otherwise below range_min | no measurement: the ray says nothing |
+| 0, with ``zero_means="nothing"`` | nothing is there: so do some cheap scanners say it |
+
+Since beyond range_max is nothing, a scan in millimetres would read as open space: it is refused before.
 """
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.deploy.sensors.sectors import (
     BODY_RADIUS_M,
     Mount,
@@ -30,6 +35,19 @@ from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
 # More than a turn and a half of rays, or so many of them, is no scan.
 _LONGEST_SCAN_RAD = 3.0 * math.pi
 _MOST_RAYS = 1_000_000
+# Two turns, and 29 degrees: beyond, angles are degrees.
+_LARGEST_ANGLE_RAD = 4.0 * math.pi
+_LARGEST_INCREMENT_RAD = 0.5
+# No scanner of a robot measures farther.
+_LONGEST_RANGE_M = 300.0
+# What a driver writes where nothing is may be this much beyond range_max; what is more than the larger multiple is no
+# reading in millimetres either.
+_BEYOND, _FAR_BEYOND = 2.0, 1000.0
+# The last numbers of 16 bits, in millimetres: so many drivers write that nothing is there.
+_LAST_OF_16_BITS_M = (65.5325, 65.5355)
+
+ZeroMeans = Literal["unknown", "nothing"]
+"""What a reading of 0 means."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +59,10 @@ class Scan:
         angle_min: angle of the first ray, rad, counter-clockwise from the sensor's x axis.
         angle_increment: from one ray to the next, rad; negative for a scan that runs clockwise.
         range_min: smallest distance that the sensor measures, m.
-        range_max: largest one, m.
+        range_max: largest one, m; may be ``inf``.
         mount: where the sensor sits.
+        zero_means: what the driver means by a reading of 0: ``"unknown"``, or ``"nothing"`` if it writes 0 where
+            nothing is. With the latter a sensor that fails with zeros reads as open space.
     """
 
     ranges: ArrayLike
@@ -51,6 +71,17 @@ class Scan:
     range_min: float
     range_max: float
     mount: Mount = field(default_factory=Mount)
+    zero_means: ZeroMeans = "unknown"
+
+
+def check_zero_means(value: object) -> None:
+    """Refuse what zeros cannot mean.
+
+    Raises:
+        UserInputError: with what they can.
+    """
+    if value not in get_args(ZeroMeans):
+        raise UserInputError(f"zero_means={value!r} is neither 'unknown' nor 'nothing': choose one")
 
 
 def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors:
@@ -65,8 +96,8 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors
         body_radius_m: what is nearer to the robot's centre is the robot, and such a ray says nothing.
 
     Raises:
-        UserInputError: if the scan cannot be one: no ray, an increment of 0, limits that are no numbers, or a sensor
-            that does not reach the 3 m that agents see.
+        UserInputError: if the scan cannot be one: no ray, an increment of 0, angles in degrees, limits that are no
+            numbers, a sensor that does not reach the 3 m that agents see, or readings that are not in metres.
 
     Example:
         >>> scan = Scan(np.full(360, 2.0), -math.pi, math.radians(1.0), 0.1, 10.0)
@@ -78,6 +109,9 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors
     with np.errstate(invalid="ignore"):
         too_near = np.isneginf(ranges)
         silent = np.isnan(ranges) | (ranges < scan.range_min) & ~too_near
+        if scan.zero_means == "nothing":
+            silent &= ranges != 0.0
+            ranges = np.where(ranges == 0.0, np.inf, ranges)
         ranges = np.where(ranges > scan.range_max, np.inf, ranges)
         ranges[too_near] = scan.range_min
     mount = scan.mount
@@ -98,23 +132,76 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors
     return Sectors(nearest, covered | np.isfinite(nearest))
 
 
+def zero_readings(scan: Scan) -> int:
+    """Return how many rays of a scan read 0 and say nothing by it."""
+    return 0 if scan.zero_means == "nothing" else int(np.count_nonzero(numbers_of(scan.ranges, "ranges") == 0.0))
+
+
 def _checked(scan: Scan) -> NDArray[np.float64]:
-    try:
-        ranges = np.asarray(scan.ranges, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise UserInputError("the scan's ranges are not numbers: give metres, one for each ray") from error
+    ranges = numbers_of(scan.ranges, "the scan's ranges")
     if ranges.ndim != 1 or not 0 < len(ranges) <= _MOST_RAYS:
         raise UserInputError(f"the scan's ranges have shape {list(ranges.shape)}: give one number for each ray")
-    numbers = (scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max)
-    if not all(is_finite_number(n) for n in numbers):
-        raise UserInputError("the scan's angles and limits are not all finite numbers: check the driver")
-    if scan.angle_increment == 0.0 or abs(scan.angle_increment) * (len(ranges) - 1) > _LONGEST_SCAN_RAD:
+    if not isinstance(scan.mount, Mount):
+        raise UserInputError(f"the scan's mount is a {type(scan.mount).__name__}: give a Mount")
+    check_zero_means(scan.zero_means)
+    _check_angles(scan, len(ranges))
+    _check_limits(scan)
+    _check_unit(ranges, scan)
+    return ranges
+
+
+def _check_angles(scan: Scan, rays: int) -> None:
+    for name in ("angle_min", "angle_increment"):
+        if not is_finite_number(getattr(scan, name)):
+            raise UserInputError(f"the scan's {name} is no finite number: check the driver")
+    if scan.angle_increment == 0.0 or abs(scan.angle_increment) * (rays - 1) > _LONGEST_SCAN_RAD:
         raise UserInputError(
-            f"the scan's increment of {scan.angle_increment:g} over {len(ranges)} rays is no scan: give radians"
+            f"the scan's increment of {scan.angle_increment:g} over {rays} rays is no scan: give radians"
         )
+    if abs(scan.angle_increment) > _LARGEST_INCREMENT_RAD:
+        raise UserInputError(
+            f"the scan's angle_increment={scan.angle_increment:g} is more than {_LARGEST_INCREMENT_RAD:g} rad, no "
+            "scan is so sparse: give radians"
+        )
+    if abs(scan.angle_min) > _LARGEST_ANGLE_RAD:
+        raise UserInputError(
+            f"the scan's angle_min={scan.angle_min:g} is more than two turns ({_LARGEST_ANGLE_RAD:.2f} rad): give "
+            "radians"
+        )
+
+
+def _check_limits(scan: Scan) -> None:
+    if not is_finite_number(scan.range_min):
+        raise UserInputError("the scan's range_min is no finite number: check the driver")
+    if not (is_finite_number(scan.range_max) or scan.range_max == math.inf):
+        raise UserInputError("the scan's range_max is no number (inf is one): check the driver")
     if not 0.0 <= scan.range_min < scan.range_max or scan.range_max < MAX_RANGE_M:
         raise UserInputError(
             f"the scan measures {scan.range_min:g} to {scan.range_max:g} m, agents see up to {MAX_RANGE_M:g} m: use "
             "a sensor that reaches so far"
         )
-    return ranges
+    if scan.range_min >= MAX_RANGE_M:
+        raise UserInputError(
+            f"the scan measures from range_min={scan.range_min:g} m on, agents see only up to {MAX_RANGE_M:g} m: give "
+            "its limits in metres"
+        )
+
+
+def _check_unit(ranges: NDArray[np.float64], scan: Scan) -> None:
+    """Refuse a scan whose readings would be beyond its own range_max in metres, and within it in cm or mm.
+
+    A driver may write any number beyond range_max where nothing is; but then the other rays read metres.
+    """
+    reach = min(scan.range_max, _LONGEST_RANGE_M)
+    beyond = ranges[(ranges > min(_BEYOND * reach, _LONGEST_RANGE_M)) & (ranges <= _FAR_BEYOND * reach)]
+    if not len(beyond):
+        return
+    within = np.count_nonzero((ranges >= scan.range_min) & (ranges <= reach) & (ranges > 0.0))
+    low, high = float(beyond.min()), float(beyond.max())
+    if low == high:  # a sign, which real readings in another unit are not
+        if _LAST_OF_16_BITS_M[0] < low < _LAST_OF_16_BITS_M[1]:
+            return
+        within *= 10
+    if within < len(beyond):
+        limit = f"its range_max of {scan.range_max:g} m" if scan.range_max == reach else f"any scanner's {reach:g} m"
+        raise UserInputError(f"the scan reads up to {high:g}, beyond {limit}: give metres, and inf where nothing is")

@@ -15,7 +15,10 @@ BODY_RADIUS_M = 0.2
 """What is nearer to the robot's centre is the robot itself: nothing else gets inside an octagon of 0.25 m, whose sides
 are 0.23 m away."""
 
-_NUMBER = int | float | np.number
+_NUMBER = int | float | np.integer | np.floating
+_NO_NUMBER = bool | np.timedelta64  # which Python, and NumPy, count among the integers
+# Farther from the centre, or more than a full turn, is another unit (mm, degrees).
+_FARTHEST_MOUNT_M = 1.0
 # Angles come as float32 and are multiples of an increment: a border itself must not fall to the wrong side.
 _BORDER_RAD = 2e-6
 
@@ -54,12 +57,19 @@ class Mount:
         """Refuse what is not finite."""
         if not all(math.isfinite(value) for value in (self.x_m, self.y_m, self.yaw_rad)):
             raise UserInputError(f"mount {self} is not finite: give metres and radians")
+        if math.hypot(self.x_m, self.y_m) > _FARTHEST_MOUNT_M:
+            raise UserInputError(
+                f"a sensor at x_m={self.x_m:g}, y_m={self.y_m:g} is more than {_FARTHEST_MOUNT_M:g} m from the robot's "
+                "centre: give metres"
+            )
+        if abs(self.yaw_rad) > 2.0 * math.pi:
+            raise UserInputError(f"yaw_rad={self.yaw_rad:g} of a sensor is more than a full turn: give radians")
 
 
 def is_finite_number(value: object) -> bool:
     """Tell whether something is one finite number, whatever it may be."""
     try:
-        return isinstance(value, _NUMBER) and math.isfinite(float(value))
+        return isinstance(value, _NUMBER) and not isinstance(value, _NO_NUMBER) and math.isfinite(float(value))
     except (OverflowError, TypeError):
         return False
 

@@ -57,7 +57,7 @@ def sectors_of_clouds(clouds: NDArray[np.float64], poses: tuple[CameraPose, ...]
 def covered(poses: tuple[CameraPose, ...]) -> NDArray[np.bool_]:
     """Return the sectors that the cameras have in view out to 3 m, bool [180]."""
     # One far point a camera stands for a cloud in which nothing is near: what is covered follows from the poses.
-    far = np.full((FILTER.min_points, 3), 100.0)
+    far = np.full((FILTER.min_points, 3), 10.0)
     return cloud_sectors([(far, pose) for pose in poses], FILTER).covered
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
+from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
-from rcdsac_trl.deploy.policy.policy import Command
 from rcdsac_trl.evaluation.course.camera_rig import camera_poses, mounted, sectors_of_clouds
 from rcdsac_trl.evaluation.course.odometry import Odometry, Pose
 from rcdsac_trl.seeding import stream

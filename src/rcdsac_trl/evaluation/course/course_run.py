@@ -1,47 +1,41 @@
-"""Everything that drives the course, run after run, and the folder that the runs are written into."""
+"""Everything that drives the course, run after run, and the tables of it."""
 
 import contextlib
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from omegaconf import DictConfig
 from tqdm import tqdm
 
-from rcdsac_trl.config.course_settings import PERIOD_S
-from rcdsac_trl.evaluation.course.course_drive import DIRECTIONS, Direction, Pilot, Trace, course_of, measures
+from rcdsac_trl.config.course_settings import PERIOD_S, CourseSettings
+from rcdsac_trl.config.run_config import read_config
+from rcdsac_trl.deploy import Policy
+from rcdsac_trl.evaluation.course.course_drive import (
+    DIRECTIONS,
+    Conditions,
+    Direction,
+    Trace,
+    course_of,
+    drive_course,
+    measures,
+)
 from rcdsac_trl.evaluation.course.course_film import FPS, frames
-from rcdsac_trl.evaluation.film.video import write_video
-from rcdsac_trl.rollout.evaluation_pool import Rows
-from rcdsac_trl.storage.results_folder import ResultsFolder
+from rcdsac_trl.evaluation.course.entries import Entry, entries_of
+from rcdsac_trl.evaluation.film.video import check_extra, write_video
+from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
+from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, drive_maps
+from rcdsac_trl.system import resources, runtime
+from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.maps.shapes import Box
-from rcdsac_trl.world.office.building import Office, make_office
-
-
-@dataclass(frozen=True)
-class Entry:
-    """Who drives, and what it is told.
-
-    Attributes:
-        run: as it was named: a folder, a shipped agent, or ``"pursuit"``.
-        agent: row of the paper's table, or ``"pursuit"``.
-        beta: how much risk it takes; of an agent that was trained for one, that one; None where there is none.
-        told: what it is told of that; None for nothing.
-        pilot: the driver.
-    """
-
-    run: str
-    agent: str
-    beta: float | None
-    told: float | None
-    pilot: Pilot
-
-    @property
-    def name(self) -> str:
-        """Who it is, for people and for file names."""
-        return self.agent if self.beta is None else f"{self.agent} beta={self.beta:g}"
+from rcdsac_trl.world.office.building import COURSE_M, Office, make_office
+from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
+from rcdsac_trl.world.task.rules import RULES_VERSION
 
 
 @dataclass(frozen=True)
@@ -63,81 +57,119 @@ def jobs_of(entries: int, repetitions: int) -> list[Job]:
     ]
 
 
-class CourseRun:
-    """All runs, and the folder they are written into.
+def make_course(cfg: DictConfig) -> MeasuredRun:
+    """Make a drive of agents over the course; refuses before anything is written.
 
     It writes ``runs.csv``, one row a run; ``traces.csv``, one row a control period; ``office.json``, what stands where;
-    ``course.json``; and films of the first repetition of each.
-
-    Args:
-        out: the folder; made when the results are there.
-        described: who drives and how; equal descriptions give equal files.
-        entries: who drives.
-        jobs: the runs.
-        drives: yields ``{"job": number, "trace": Trace}`` of each run as it has been driven.
-        record: whether to make films.
+    ``course.json``; and, if asked for, films of the first repetition of each.
 
     Raises:
-        UserInputError: if the folder holds something else.
+        UserInputError: for an agent that is missing or sees what the cameras do not, a beta outside its range, or a
+            package that is not installed.
     """
+    settings = read_config(cfg, CourseSettings)
+    if settings.record:
+        check_extra()
+    entries = entries_of(settings)
+    jobs = jobs_of(len(entries), settings.repetitions)
+    processes = resolve_processes(settings.num_workers, len(jobs))
+    simulations = 2 * max(1, processes)  # the physics, and what the cameras see
+    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, "lower num_workers")
+    conditions = Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed)
 
-    def __init__(
-        self,
-        *,
-        out: Path,
-        described: Mapping[str, Any],
-        entries: Sequence[Entry],
-        jobs: Sequence[Job],
-        drives: Callable[[], Generator[Rows, None, None]],
-        record: bool,
-    ) -> None:
-        self.results = ResultsFolder(out, "course.json", described)
-        self._entries = entries
-        self._jobs = jobs
-        self._drives = drives
-        self._record = record
+    def drives() -> Generator[Rows, None, None]:
+        return drive_maps(partial(_driver, entries, jobs, conditions, settings.record), len(jobs), processes)
 
-    def run(self) -> None:
-        """Drive and write.
+    return MeasuredRun(
+        kind="course",
+        out=_default_out(settings, entries) if settings.out is None else Path(settings.out),
+        described=_described(settings, entries),
+        unit="run",
+        num_units=len(jobs),
+        measure=drives,
+        findings=_findings,
+        film=partial(_films, entries) if settings.record else None,
+    )
 
-        Raises:
-            UserInputError: if something else was written into the folder meanwhile.
-        """
-        office = make_office()
-        rows: dict[int, dict[str, Any]] = {}
-        traces: dict[int, pd.DataFrame] = {}
-        recorded: dict[int, Trace] = {}
-        with contextlib.closing(self._drives()) as drives:
-            for driven in tqdm(drives, total=len(self._jobs), unit="run", disable=None):
-                for result in driven:
-                    number, trace = result["job"], result["trace"]
-                    job = self._jobs[number]
-                    rows[number] = self._labels(job) | measures(trace, course_of(office, job.direction))
-                    traces[number] = _table(trace).assign(**self._labels(job))
-                    if self._record and job.repetition == 0:
-                        recorded[number] = trace
-        order = range(len(self._jobs))
-        tables = {
-            "runs.csv": pd.DataFrame([rows[number] for number in order]),
-            "traces.csv": pd.concat([traces[number] for number in order], ignore_index=True),
+
+def _described(settings: CourseSettings, entries: Sequence[Entry]) -> dict[str, Any]:
+    """Say who drives and how."""
+    return {
+        "entries": [{"run": entry.run, "agent": entry.agent, "beta": entry.beta} for entry in entries],
+        "agents": {entry.run: asdict(entry.pilot.config) for entry in entries if isinstance(entry.pilot, Policy)},
+        "course_m": COURSE_M,
+        "guard_margin_m": settings.guard_margin_m,
+        "repetitions": settings.repetitions,
+        "seed": settings.seed,
+        "time_limit_s": settings.time_limit_s,
+        "camera": asdict(settings.camera),
+        "odometry": asdict(settings.odometry),
+        "rules_version": RULES_VERSION,
+        "commit": commit(),
+    }
+
+
+def _default_out(settings: CourseSettings, entries: Sequence[Entry]) -> Path:
+    runs = list(dict.fromkeys(entry.run for entry in entries))
+    folder = Path(runs[0]) / "course" if len(runs) == 1 and Path(runs[0]).is_dir() else Path("course")
+    betas = "" if settings.beta is None else "-beta" + "_".join(f"{beta:g}" for beta in settings.beta)
+    who = "" if folder != Path("course") else "-".join(Path(run).name for run in runs) + "-"
+    margin = "none" if settings.guard_margin_m is None else f"{settings.guard_margin_m:g}"
+    return folder / f"{who}seed{settings.seed}-{settings.repetitions}x{betas}-guard{margin}"
+
+
+@contextlib.contextmanager
+def _driver(entries: Sequence[Entry], jobs: Sequence[Job], conditions: Conditions, record: bool) -> Iterator[Drive]:
+    """Make what drives one run after another, in this process."""
+    runtime.set_threads(1)
+    office = make_office()
+
+    def drive(number: int, before_step: Callable[[], None]) -> Rows:
+        job = jobs[number]
+        entry = entries[job.entry]
+        trace = drive_course(office, entry.pilot, entry.context, job.direction, job.repetition, conditions, before_step)
+        labels: dict[str, Any] = {
+            "run": entry.run,
+            "agent": entry.agent,
+            "beta": float("nan") if entry.beta is None else entry.beta,
+            "direction": job.direction,
+            "repetition": job.repetition,
         }
-        written = {name: table.to_csv(index=False, float_format="%.6g") for name, table in tables.items()}
-        self.results.write(written | {"office.json": plan_of(office)})
-        for number, trace in tqdm(sorted(recorded.items()), unit="film", disable=None if recorded else True):
-            self._film(office, self._jobs[number], trace)
+        row = {
+            "number": number,
+            "job": job,
+            "measures": labels | measures(trace, course_of(office, job.direction)),
+            "steps": _steps(trace).assign(**labels),
+        }
+        # Only what is filmed is kept whole.
+        return [row | {"trace": trace} if record and job.repetition == 0 else row]
 
-    def _labels(self, job: Job) -> dict[str, Any]:
-        entry = self._entries[job.entry]
-        beta = float("nan") if entry.beta is None else entry.beta
-        labels = {"run": entry.run, "agent": entry.agent, "beta": beta}
-        return labels | {"direction": job.direction, "repetition": job.repetition}
+    yield drive
 
-    def _film(self, office: Office, job: Job, trace: Trace) -> None:
-        entry = self._entries[job.entry]
-        course = course_of(office, job.direction)
+
+def _findings(rows: Rows) -> Findings:
+    rows = sorted(rows, key=lambda row: row["number"])
+    tables = {
+        "runs.csv": pd.DataFrame([row["measures"] for row in rows]),
+        "traces.csv": pd.concat([row["steps"] for row in rows], ignore_index=True),
+    }
+    written = {name: table.to_csv(index=False, float_format="%.6g") for name, table in tables.items()}
+    return Findings(written | {"office.json": plan_of(make_office())})
+
+
+def _films(entries: Sequence[Entry], folder: Path, rows: Rows) -> list[Path]:
+    """Film the runs whose traces were kept."""
+    office = make_office()
+    kept = sorted((row for row in rows if "trace" in row), key=lambda row: row["number"])
+    files = []
+    for row in tqdm(kept, unit="film", disable=None):
+        job, trace = row["job"], row["trace"]
+        entry = entries[job.entry]
         title = f"{entry.name}, {job.direction}{'' if trace.finished else ', not finished'}"
         stem = f"{job.entry}-{entry.name}-{job.direction}".replace(" ", "-")
-        write_video(frames(office, entry.pilot, trace, course, title), self.results.path / stem, FPS)
+        course = course_of(office, job.direction)
+        files += write_video(frames(office, entry.pilot, trace, course, title), folder / stem, FPS)
+    return files
 
 
 def plan_of(office: Office) -> str:
@@ -158,7 +190,7 @@ def plan_of(office: Office) -> str:
     return json.dumps({"size_m": office.map.size_m, "course": office.course.round(6).tolist(), "shapes": shapes}) + "\n"
 
 
-def _table(trace: Trace) -> pd.DataFrame:
+def _steps(trace: Trace) -> pd.DataFrame:
     """Return a run step by step."""
     columns = {
         "time_s": [step * PERIOD_S for step in range(len(trace.poses))],

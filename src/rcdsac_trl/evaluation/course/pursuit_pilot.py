@@ -4,8 +4,8 @@ from typing import Any
 
 import torch
 
+from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
-from rcdsac_trl.deploy.policy.policy import Command
 from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import waypoint_observation
 from rcdsac_trl.rollout.planners.pursuit import pursuit_action

@@ -1,4 +1,4 @@
-"""The frames of a film: episodes side by side, each with its map, what it was told, and what its critics expect."""
+"""The frames of a film: episodes side by side, each with its map, its context, and what its critics expect."""
 
 import math
 from collections.abc import Iterator, Sequence

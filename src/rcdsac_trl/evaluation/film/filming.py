@@ -1,4 +1,4 @@
-"""A film of an evaluation's episodes, and a picture of their ways."""
+"""A film of an evaluation's episodes, and a picture of their trajectories."""
 
 import io
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from tqdm import tqdm
 from rcdsac_trl.config.evaluation_settings import VideoSettings
 from rcdsac_trl.evaluation.film.episode_film import Track, film
 from rcdsac_trl.evaluation.film.recording import Moment, Recorder
-from rcdsac_trl.evaluation.film.trajectories import ways
+from rcdsac_trl.evaluation.film.trajectories import trajectories
 from rcdsac_trl.evaluation.film.video import write_video
 from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.rollout.make_agent import unpacked_loss
@@ -26,13 +26,13 @@ from rcdsac_trl.world.task.episode import draw_motor_steps
 def write_film(
     course: Course, agent: Agent | None, video: VideoSettings, headings: Sequence[str], folder: Path
 ) -> list[Path]:
-    """Drive the episodes of a map once more, film one under every condition, and draw the ways driven.
+    """Drive the episodes of a map once more, film one under every condition, and draw the trajectories.
 
     All agents drive again, so that those that are filmed do, bit by bit, what they did when they were measured.
 
     Args:
         course: what is driven.
-        agent: what drives; None: pursuit drives.
+        agent: what drives; None: the baseline drives.
         video: which episode is filmed.
         headings: one a condition.
         folder: takes the files.
@@ -47,7 +47,7 @@ def write_film(
     name = f"map{video.map}-episode{video.episode}"
     films = write_video(frames, folder / f"video-{name}", video.fps)
     picture = io.BytesIO()
-    Image.fromarray(ways(named)).save(picture, "png", optimize=True)
+    Image.fromarray(trajectories(named)).save(picture, "png", optimize=True)
     atomic.write(folder / f"ways-{name}.png", picture.getvalue())
     return [*films, folder / f"ways-{name}.png"]
 

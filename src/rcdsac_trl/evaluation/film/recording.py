@@ -19,7 +19,7 @@ class Moment:
 
     Attributes:
         scene: what there is around it.
-        beta: what it is told; None for an agent that is told none.
+        beta: its context; None for an agent that has none.
         speed_m_per_s: measured linear velocity, backwards below 0.
         collisions: contacts begun so far.
         goals: reached so far.

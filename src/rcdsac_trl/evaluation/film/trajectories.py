@@ -1,4 +1,4 @@
-"""Ways of whole episodes in one picture: the same start and goals under several conditions, side by side."""
+"""Trajectories of whole episodes in one picture: the same start and goals under several conditions, side by side."""
 
 import itertools
 import math
@@ -13,10 +13,10 @@ from rcdsac_trl.evaluation.film.recording import Moment
 from rcdsac_trl.world.render import TEXT, TOUCHING, Renderer, font
 
 _SIDE_PX = 560
-_SAID = "pale to dark: the way driven; numbered: goals reached;\nred: where a contact began; who walks is not shown"
+_LEGEND = "pale to dark: the way driven; numbered: goals reached;\nred: where a contact began; who walks is not shown"
 
 
-def ways(tracks: Sequence[Track]) -> NDArray[np.uint8]:
+def trajectories(tracks: Sequence[Track]) -> NDArray[np.uint8]:
     """Return the picture, uint8 RGB ``[height, width, 3]``: a panel an episode, at most four in a line.
 
     Above each map stands what drove, below it what came of it.
@@ -40,7 +40,7 @@ def ways(tracks: Sequence[Track]) -> NDArray[np.uint8]:
         draw.text(below, _outcome(track.moments), colour, font=normal, anchor="mm")
     small = font(0.027 * _SIDE_PX)
     middle = (_SIDE_PX * columns // 2, sheet.height - head // 2)
-    draw.multiline_text(middle, _SAID, FAINT, font=small, anchor="mm", align="center")
+    draw.multiline_text(middle, _LEGEND, FAINT, font=small, anchor="mm", align="center")
     return np.array(sheet)
 
 
@@ -52,8 +52,8 @@ def _panel(moments: Sequence[Moment], renderer: Renderer) -> NDArray[np.uint8]:
             touches.append(now.scene.pose[:2])
         if now.goals > then.goals:  # a goal that is reached is gone: the moment before still shows it
             goals.append(tuple(then.scene.waypoints[-1].tolist()))
-    way = [moment.scene.pose[:2] for moment in moments]
-    return renderer.draw_way(moments[0].scene.map, way, goals, touches)
+    trajectory = [moment.scene.pose[:2] for moment in moments]
+    return renderer.draw_way(moments[0].scene.map, trajectory, goals, touches)
 
 
 def _outcome(moments: Sequence[Moment]) -> str:

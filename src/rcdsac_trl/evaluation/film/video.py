@@ -115,9 +115,9 @@ def _write_mp4(frames: Iterator[Frame], path: Path, fps: float) -> None:
             with contextlib.suppress(BrokenPipeError):  # what is not written yet
                 encoder.stdin.close()
             raise
-        told = encoder.communicate()[1].decode(errors="replace")
+        messages = encoder.communicate()[1].decode(errors="replace")
     if encoder.returncode != 0:
-        raise FaultError(f"the film was not written: {' '.join(told.split()) or 'ffmpeg failed'}")
+        raise FaultError(f"the film was not written: {' '.join(messages.split()) or 'ffmpeg failed'}")
 
 
 def _evened(frame: Frame) -> Frame:

@@ -15,9 +15,10 @@ holds a function, not of the files it calls into.
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rcdsac_trl.system.jit import njit
 
 CELL_M = 0.1
 """Side of a grid cell, m."""
@@ -34,7 +35,7 @@ def leg_clearance_m(clearance_m: float, cell_m: float = CELL_M) -> float:
     return math.sqrt(clearance_m**2 - 0.5 * cell_m**2)
 
 
-@numba.njit(cache=True)
+@njit
 def _point_box(x: float, y: float, half_x: float, half_y: float) -> float:
     """Return the distance from a point in the box's frame to the solid box, 0 inside."""
     dx = max(abs(x) - half_x, 0.0)
@@ -42,7 +43,7 @@ def _point_box(x: float, y: float, half_x: float, half_y: float) -> float:
     return math.sqrt(dx * dx + dy * dy)
 
 
-@numba.njit(cache=True)
+@njit
 def _point_segment(px: float, py: float, ax: float, ay: float, bx: float, by: float) -> float:
     dx, dy = bx - ax, by - ay
     length2 = dx * dx + dy * dy
@@ -52,7 +53,7 @@ def _point_segment(px: float, py: float, ax: float, ay: float, bx: float, by: fl
     return math.hypot(ax + t * dx - px, ay + t * dy - py)
 
 
-@numba.njit(cache=True)
+@njit
 def _segment_enters_box(ax: float, ay: float, bx: float, by: float, hx: float, hy: float) -> bool:
     """Clip the segment a-b to the slab of each axis; something is left when it meets the solid box."""
     t0, t1 = 0.0, 1.0
@@ -66,7 +67,7 @@ def _segment_enters_box(ax: float, ay: float, bx: float, by: float, hx: float, h
     return t0 <= t1
 
 
-@numba.njit(cache=True)
+@njit
 def _segment_box(ax: float, ay: float, bx: float, by: float, hx: float, hy: float) -> float:
     """Return the distance from a segment in the box's frame to the solid box."""
     if _segment_enters_box(ax, ay, bx, by, hx, hy):
@@ -79,7 +80,7 @@ def _segment_box(ax: float, ay: float, bx: float, by: float, hx: float, hy: floa
     return best
 
 
-@numba.njit(cache=True)
+@njit
 def segment_clearance(
     ax: float,
     ay: float,
@@ -110,7 +111,7 @@ def segment_clearance(
     return best
 
 
-@numba.njit(cache=True)
+@njit
 def _is_clear(
     ax: float,
     ay: float,
@@ -153,7 +154,7 @@ def _is_clear(
     return True
 
 
-@numba.njit(cache=True)
+@njit
 def _bounding_boxes(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return half the sides [n, 2] of the axis-parallel boxes around boxes [n, 6]."""
     extents = np.empty((boxes.shape[0], 2))
@@ -164,7 +165,7 @@ def _bounding_boxes(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
     return extents
 
 
-@numba.njit(cache=True)
+@njit
 def lower_clearance(
     clearance: NDArray[np.float64],
     boxes: NDArray[np.float64],
@@ -199,7 +200,7 @@ def lower_clearance(
                 clearance[row, column] = min(clearance[row, column], distance)
 
 
-@numba.njit(cache=True)
+@njit
 def _leg_cost(ax: float, ay: float, bx: float, by: float, weight: NDArray[np.float64], cell_m: float) -> float:
     """Return the length of a straight leg times the mean weight under it, sampled twice a cell."""
     rows, columns = weight.shape
@@ -214,7 +215,7 @@ def _leg_cost(ax: float, ay: float, bx: float, by: float, weight: NDArray[np.flo
     return length * total / count
 
 
-@numba.njit(cache=True)
+@njit
 def pull_tight(
     points: NDArray[np.float64],
     boxes: NDArray[np.float64],

@@ -7,14 +7,15 @@ column, and eight neighbours: a diagonal step between free cells is safe whateve
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from rcdsac_trl.system.jit import njit
 
 _SQRT2 = math.sqrt(2.0)
 
 
-@numba.njit(cache=True)
+@njit
 def nearest_cell(free: NDArray[np.bool_], x: float, y: float, cell_m: float) -> int:
     """Return the flat index of the free cell whose centre is nearest to a point, -1 when none is free."""
     rows, columns = free.shape
@@ -36,7 +37,7 @@ def nearest_cell(free: NDArray[np.bool_], x: float, y: float, cell_m: float) -> 
         reach *= 4
 
 
-@numba.njit(cache=True)
+@njit
 def label_components(free: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
     """Number the 8-connected components of the free cells 1, 2, ...; 0 is what is not free."""
     rows, columns = free.shape
@@ -62,7 +63,7 @@ def label_components(free: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
     return labels, count
 
 
-@numba.njit(cache=True)
+@njit
 def keeps_connected(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> bool:
     """Tell whether the cells free in both that are connected in ``before`` still are in ``after``."""
     old, num_old = label_components(before)
@@ -79,7 +80,7 @@ def keeps_connected(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> bool
     return True
 
 
-@numba.njit(cache=True)
+@njit
 def _push(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int, cost: float, node: int) -> None:
     """Add an entry to a binary heap of ``size`` entries; ties go to the smaller node, so order is fixed."""
     i = size
@@ -92,7 +93,7 @@ def _push(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int, cost:
     costs[i], nodes[i] = cost, node
 
 
-@numba.njit(cache=True)
+@njit
 def _pop(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int) -> int:
     """Remove the least entry of a binary heap of ``size`` entries and return its node."""
     least = nodes[0]
@@ -115,7 +116,7 @@ def _pop(costs: NDArray[np.float64], nodes: NDArray[np.int32], size: int) -> int
     return least
 
 
-@numba.njit(cache=True)
+@njit
 def cheapest_path(free: NDArray[np.bool_], weight: NDArray[np.float64], start: int, goal: int) -> NDArray[np.int32]:
     """Return the cheapest 8-connected path over free cells by A*, both ends included.
 

@@ -8,10 +8,10 @@ form, which is both exact and an order of magnitude faster than casting rays.
 
 import math
 
-import numba
 import numpy as np
 
 from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.system.jit import njit
 
 _BIN_RAD = 2.0 * math.pi / NUM_BINS
 # Directions of the borders between the bins; border b is where bin b (from 0) begins.
@@ -19,7 +19,7 @@ _BORDER_COS = np.cos(np.arange(NUM_BINS) * _BIN_RAD)
 _BORDER_SIN = np.sin(np.arange(NUM_BINS) * _BIN_RAD)
 
 
-@numba.njit(cache=True)
+@njit
 def _bin_of(angle: float) -> int:
     """Return the bin (from 0) of an angle in [-2 pi, 2 pi], rad."""
     if angle < 0.0:
@@ -28,7 +28,7 @@ def _bin_of(angle: float) -> int:
     return int(angle / _BIN_RAD) % NUM_BINS
 
 
-@numba.njit(cache=True)
+@njit
 def _add_segment(out: np.ndarray, px: float, py: float, qx: float, qy: float, max_range: float) -> None:
     """Lower ``out`` to the distances of the segment p-q, given in the sensor's frame."""
     ex, ey = qx - px, qy - py
@@ -71,7 +71,7 @@ def _add_segment(out: np.ndarray, px: float, py: float, qx: float, qy: float, ma
         bin_ = border
 
 
-@numba.njit(cache=True)
+@njit
 def _add_circle(out: np.ndarray, cx: float, cy: float, radius: float, max_range: float) -> None:
     """Lower ``out`` to the distances of a disc, given in the sensor's frame."""
     centre2 = cx * cx + cy * cy
@@ -100,7 +100,7 @@ def _add_circle(out: np.ndarray, cx: float, cy: float, radius: float, max_range:
         _lower_to_ray(out, bin_, border, cx, cy, free2)
 
 
-@numba.njit(cache=True)
+@njit
 def _lower_to_ray(out: np.ndarray, bin_: int, border: int, cx: float, cy: float, free2: float) -> None:
     """Lower one bin to where the ray along ``border`` first meets the disc."""
     projection = cx * _BORDER_COS[border] + cy * _BORDER_SIN[border]
@@ -109,7 +109,7 @@ def _lower_to_ray(out: np.ndarray, bin_: int, border: int, cx: float, cy: float,
     out[bin_] = min(out[bin_], distance)
 
 
-@numba.njit(cache=True)
+@njit
 def scan(
     out: np.ndarray,
     x: float,

@@ -5,8 +5,9 @@ All that the compiled code uses stands in this file: Numba's cache notices no ch
 
 import math
 
-import numba
 import numpy as np
+
+from rcdsac_trl.system.jit import njit
 
 MAX_ACCELERATION = 0.7
 """Bound on speeding up and braking, and again on turning, m/s^2; so both together stay within 1 m/s^2."""
@@ -31,7 +32,7 @@ def notice_gap(top_speed: float, period_s: float) -> float:
     return STOP_GAP_M + ((top_speed + lost) ** 2 - lost**2) / (2.0 * PROFILE_ACCELERATION) + 0.01
 
 
-@numba.njit(cache=True)
+@njit
 def _piece_at(tours: np.ndarray, first: int, last: int, along: float) -> int:
     """Return the row in [first, last) of the piece on which the distance ``along`` lies."""
     while last - first > 1:
@@ -43,7 +44,7 @@ def _piece_at(tours: np.ndarray, first: int, last: int, along: float) -> int:
     return first
 
 
-@numba.njit(cache=True)
+@njit
 def point_on(tours: np.ndarray, first: int, last: int, along: float) -> tuple[float, float, float]:
     """Return x, y and heading at a distance along the tour in rows [first, last)."""
     piece = tours[_piece_at(tours, first, last, along)]
@@ -56,7 +57,7 @@ def point_on(tours: np.ndarray, first: int, last: int, along: float) -> tuple[fl
     return x, y, turned
 
 
-@numba.njit(cache=True)
+@njit
 def _gap_ahead(x: float, y: float, cos: float, sin: float, other_x: float, other_y: float, reach: float) -> float:
     """Return how far one can walk straight on until within the side gap of a disc at distance ``reach``."""
     dx, dy = other_x - x, other_y - y
@@ -67,7 +68,7 @@ def _gap_ahead(x: float, y: float, cos: float, sin: float, other_x: float, other
     return forward - math.sqrt(reach * reach - aside * aside)
 
 
-@numba.njit(cache=True)
+@njit
 def _step(
     k: int,
     walks: np.ndarray,
@@ -118,7 +119,7 @@ def _step(
     discs[k, 0], discs[k, 1], _ = point_on(tours, first, last, along)
 
 
-@numba.njit(cache=True)
+@njit
 def walk(
     walks: np.ndarray,
     discs: np.ndarray,

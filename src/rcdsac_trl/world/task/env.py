@@ -1,15 +1,15 @@
 """The navigation task as a TorchRL environment, in one process or over several workers."""
 
 import multiprocessing
+import signal
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase, SerialEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.processes import START_METHOD, resolve_num_workers
@@ -17,11 +17,12 @@ from rcdsac_trl.world.maps.generator import MapSettings, Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task.agent_group import AgentGroup
-from rcdsac_trl.world.task.parallel import Workers, worker_env
 from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, Space
 
 COLLISION_WEIGHT = "collision_weight"
+# How long workers may take to close.
+_SHUTDOWN_S = 5.0
 
 
 class NavigationEnv(OfOneProcess, EnvBase):
@@ -234,8 +235,8 @@ def make_env(
     Raises:
         UserInputError: the workers cannot share the agents evenly, or as :class:`NavigationEnv`.
 
-    What it returns raises :class:`~rcdsac_trl.system.processes.WorkerError` when a worker process dies or hangs; it can
-    then only be closed.
+    With workers it is TorchRL's own ``ParallelEnv``: where a worker process dies or gives no answer in time, it raises
+    ``RuntimeError`` and can then only be closed; and when it is closed, it lets torch use up to a thread a worker more.
 
     Example:
         >>> make_env(num_workers=0).batch_size
@@ -261,10 +262,25 @@ def make_env(
     if serial:
         return SerialEnv(workers, NavigationEnv, create_env_kwargs=kwargs)
     multiprocessing.set_forkserver_preload([__name__])
-    return Workers(
+    env = ParallelEnv(
         workers,
-        partial(worker_env, NavigationEnv),
+        _env_of_a_worker,
         create_env_kwargs=kwargs,
         mp_start_method=START_METHOD,
-        timeout_s=worker_timeout_s,
+        daemon=True,
+        # Else it takes a thread a worker from this process; here workers rest while the learner computes.
+        num_threads=torch.get_num_threads(),
+        shutdown_timeout=_SHUTDOWN_S,
     )
+    env.start()
+    if worker_timeout_s is not None:
+        env.BATCHED_PIPE_TIMEOUT = worker_timeout_s
+    return env
+
+
+def _env_of_a_worker(**named: Any) -> NavigationEnv:
+    """Make the environment of a worker process; the main process makes one too, to learn its specs."""
+    if multiprocessing.parent_process() is not None:
+        # A terminal sends Ctrl-C to all processes; workers that died of it could not be closed properly any more.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return NavigationEnv(**named)

@@ -1,15 +1,15 @@
-"""A sweep from its command line: what is meant for it, what for its runs, and which runs that makes."""
+"""The jobs of a sweep from its command line: what is meant for the sweep, what for its runs, which runs that makes."""
 
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from rcdsac_trl.config.algo_settings import AlgoSettings
-from rcdsac_trl.config.compose import combinations, compose, parse, sweep_folder
+from rcdsac_trl.config.compose import combinations, compose, key_of, parse, sweep_folder
 from rcdsac_trl.config.experiment_settings import ExperimentSettings
-from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.config.run_config import plain, training_settings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.experiments.launchers import read_launcher
@@ -26,7 +26,7 @@ _NAMED = ("algo", "sensor", "seed")
 
 def is_meant_for_a_sweep(override: str) -> bool:
     """Whether an override chooses runs, or where they run, and not what one of them does."""
-    key = _key(override)
+    key = key_of(override)
     return key == _FOLDER or key.split(".")[0] in _GROUPS
 
 
@@ -53,16 +53,14 @@ def make_sweep(overrides: list[str]) -> Sweep:
     own = [_without_plus(override) for override in overrides if is_meant_for_a_sweep(override)]
     given = [override for override in overrides if not is_meant_for_a_sweep(override)]
     for override in given:
-        if re.match(r"hydra\b", _key(override)):
+        if re.match(r"hydra\b", key_of(override)):
             raise UserInputError(f"{override} has no effect on a sweep: leave it out, and choose launcher=<name>")
-        if _key(override) == "resume":
+        if key_of(override) == "resume":
             raise UserInputError(
                 f"{override} continues one run: leave -m out; a sweep goes on when its call is repeated with its "
                 f"{_FOLDER}"
             )
-    cfg = compose(CONFIG, own)
-    values = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(values, dict)
+    values = plain(compose(CONFIG, own))
     experiment = read(ExperimentSettings, values["experiment"], "experiment")
     launcher = read_launcher(values["launcher"])
     # As composed once: its default name is the time.
@@ -89,11 +87,11 @@ def _jobs(experiment: ExperimentSettings, given: list[str], folder: Path) -> Ite
 
 
 def _check_not_contradicted(name: str, own: Iterable[str], given: Iterable[str]) -> None:
-    makes = {_key(override): override for override in own}
+    makes = {key_of(override): override for override in own}
     for override in given:
-        if _key(override) in makes:
+        if key_of(override) in makes:
             raise UserInputError(
-                f"{override} contradicts {makes[_key(override)]}, which makes the run {name} what it is: leave it "
+                f"{override} contradicts {makes[key_of(override)]}, which makes the run {name} what it is: leave it "
                 "out, or choose other runs with experiment.only=[<name>]"
             )
 
@@ -103,16 +101,16 @@ def _merged(*layers: Iterable[str]) -> list[str]:
     found: dict[str, str] = {}
     for layer in layers:
         for override in layer:
-            found[_key(override)] = override
+            found[key_of(override)] = override
     return list(found.values())
 
 
 def _combined(experiment: ExperimentSettings, run: str | None, overrides: list[str], folder: Path) -> Iterator[Job]:
-    varied = {_key(o.input_line or "") for o in parse(overrides) if o.is_sweep_override()}
+    varied = {key_of(o.input_line or "") for o in parse(overrides) if o.is_sweep_override()}
     for job in combinations(overrides):
         cfg = compose("train", job)
         check_training(cfg)
-        name = _name(run, cfg, [o for o in job if _key(o) in varied and _key(o) not in _NAMED])
+        name = _name(run, cfg, [o for o in job if key_of(o) in varied and key_of(o) not in _NAMED])
         if differing := differing_keys(folder / name, cfg):
             raise UserInputError(
                 f"{folder / name} holds a run of another config ({', '.join(differing[:3])}): choose another {_FOLDER}"
@@ -135,11 +133,11 @@ def _name(run: str | None, cfg: DictConfig, varied: Iterable[str]) -> str:
     named = [] if run is None else [run]
     if run is None or not run.startswith(algo):
         named.append(algo)
-    parts = [*named, cfg.sensor.name, f"s{cfg.seed}"]
+    words = [*named, cfg.sensor.name, f"s{cfg.seed}"]
     for override in varied:
         key, _, value = override.lstrip("+").partition("=")
-        parts.insert(-1, f"{key.split('.')[-1]}_{value}")
-    return re.sub(r"[^\w.+-]+", "_", "-".join(parts))
+        words.insert(-1, f"{key.split('.')[-1]}_{value}")
+    return re.sub(r"[^\w.+-]+", "_", "-".join(words))
 
 
 def _check_names(jobs: Iterable[Job]) -> None:
@@ -154,18 +152,14 @@ def _check_names(jobs: Iterable[Job]) -> None:
 
 
 def _evaluate(experiment: ExperimentSettings, algo: AlgoSettings) -> tuple[str, ...] | None:
-    """Return what `evaluate` is told of a job; a risk-conditioned agent must be given its betas."""
+    """Return the overrides of a job's `evaluate`; a risk-conditioned agent must be given its betas."""
     if experiment.evaluate is None:
         return None
     betas = algo.distortion.evaluation_betas if algo.conditioning == "per_episode" else ()
-    told = [f"beta=[{','.join(f'{beta:g}' for beta in betas)}]"] if betas else []
-    return tuple(_merged(told, experiment.evaluate))
-
-
-def _key(override: str) -> str:
-    return override.lstrip("+~").partition("=")[0]
+    contexts = [f"beta=[{','.join(f'{beta:g}' for beta in betas)}]"] if betas else []
+    return tuple(_merged(contexts, experiment.evaluate))
 
 
 def _without_plus(override: str) -> str:
     """Read +experiment=<name>, which looks like +algo=<name>, as experiment=<name>."""
-    return override.lstrip("+") if _key(override) in _GROUPS else override
+    return override.lstrip("+") if key_of(override) in _GROUPS else override

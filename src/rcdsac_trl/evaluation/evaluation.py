@@ -1,0 +1,184 @@
+"""Evaluation: the same maps, starts and goals for every agent, deterministic actions, one row an episode."""
+
+import sys
+from collections.abc import Generator
+from dataclasses import asdict
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.config.evaluation_settings import EvaluationSettings, Name
+from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_of_run, training_settings
+from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation.film.filming import write_film
+from rcdsac_trl.evaluation.film.video import check_extra
+from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
+from rcdsac_trl.rollout.evaluation_pool import Rows, drive_maps
+from rcdsac_trl.rollout.make_agent import make_average, make_loss, packed, packed_loss
+from rcdsac_trl.rollout.map_evaluator import Agent, Course, driver
+from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS, table_of
+from rcdsac_trl.rollout.metrics import summarise
+from rcdsac_trl.rollout.planners.baselines import PURSUIT, check_baseline, settings_of
+from rcdsac_trl.storage.checkpoint import load_weights
+from rcdsac_trl.storage.checkpoint_record import find
+from rcdsac_trl.system import resources, runtime
+from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.system.provenance import commit
+from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
+from rcdsac_trl.world.task.world_settings import WorldSettings
+
+
+def make_evaluation(cfg: DictConfig) -> MeasuredRun:
+    """Make an evaluation of a run or a baseline; refuses before anything is written.
+
+    It writes ``episodes.csv``, ``summary.csv``, ``evaluation.json`` and, if asked for, films.
+
+    Raises:
+        UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit, a
+            baseline that cannot drive.
+    """
+    settings = read_config(cfg, EvaluationSettings)
+    if settings.record:
+        check_extra()
+    trained = _trained(settings)
+    course = _course(settings, trained)
+    if settings.baseline is not None:
+        check_baseline(settings.baseline, course.world.sensor)
+    processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
+    simulations = max(1, processes) * course.world.num_agents
+    remedy = "lower num_episodes or num_workers, or end other programs"
+    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
+    if settings.run is not None:
+        find(Path(settings.run) / CHECKPOINTS, settings.checkpoint)
+
+    @cache  # Read once: a training that goes on may write another checkpoint meanwhile.
+    def agent() -> Agent | None:
+        return None if settings.run is None else _read_agent(trained, Path(settings.run), settings.checkpoint)
+
+    def maps() -> Generator[Rows, None, None]:
+        make = partial(driver, course, *(agent() or (None,)))
+        return drive_maps(make, settings.num_maps, processes)
+
+    def film(folder: Path, rows: Rows) -> list[Path]:
+        headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in course.conditions]
+        return write_film(course, agent(), settings.video, headings, folder)
+
+    return MeasuredRun(
+        kind="evaluation",
+        out=Path(settings.out) if settings.out is not None else _default_out(settings, course),
+        described=_described(settings, course),
+        unit="map",
+        num_units=settings.num_maps,
+        measure=maps,
+        findings=_findings,
+        film=film if settings.record else None,
+    )
+
+
+def _course(settings: EvaluationSettings, trained: TrainingSettings) -> Course:
+    conditions = [Condition()]
+    if settings.run is not None:
+        conditions = trained.algo.conditions(settings.beta, settings.collision_weight)
+    controllers = settings.beta_controller or ()
+    conditions += [Condition(controller=name) for name in controllers]
+    return Course(
+        trained=trained,
+        world=_evaluation_world(settings, trained, len(conditions)),
+        conditions=conditions,
+        split=settings.split,
+        seed=settings.seed,
+        num_episodes=settings.num_episodes,
+        sampled=settings.sampled,
+        device=runtime.resolve_device(settings.device),
+        threads=1 if settings.threads == "auto" else settings.threads,
+        trips=True,
+        controller=settings.controller if controllers else None,
+        baseline=settings.baseline or PURSUIT,
+    )
+
+
+def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
+    """Name what drives."""
+    return trained.algo.name if settings.baseline is None else settings.baseline
+
+
+def _default_out(settings: EvaluationSettings, course: Course) -> Path:
+    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
+    if settings.run is None:
+        return Path("evaluation") / f"{settings.baseline}-{course.world.sensor}-{name}".replace(":", "-")
+    contexts = "".join(f"-{condition}".replace("=", "_") for condition in course.conditions)
+    return Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{contexts}"
+
+
+def _described(settings: EvaluationSettings, course: Course) -> dict[str, Any]:
+    """Say what is measured and how."""
+    trained, is_run = course.trained, settings.run is not None
+    described = {
+        "agent": _name(settings, trained),
+        "measure": trained.algo.distortion.name if is_run else None,
+        "sensor": course.world.sensor,
+        "train_seed": trained.seed if is_run else None,
+        "checkpoint": settings.checkpoint if is_run else None,
+        "split": settings.split,
+        "seed": settings.seed,
+        "num_maps": settings.num_maps,
+        "num_episodes": settings.num_episodes,
+        "sampled": settings.sampled,
+        "conditions": [str(condition) for condition in course.conditions],
+        "map": asdict(course.world.map_settings),
+        "task": asdict(course.world.task),
+        "commit": commit(),
+    }
+    if course.controller is not None:
+        described["controller"] = asdict(course.controller)
+    return described if settings.baseline is None else described | settings_of(settings.baseline)
+
+
+def _findings(rows: Rows) -> Findings:
+    episodes = table_of([rows])
+    summary = summarise(episodes, [key for key in CONDITION_COLUMNS if key in episodes])
+    shown = summary.dropna(axis="columns", how="all").set_index("episodes")
+    return Findings(
+        {
+            "episodes.csv": episodes.to_csv(index=False, float_format="%.9g"),
+            "summary.csv": summary.to_csv(index=False, float_format="%.6g"),
+        },
+        text=shown.T.to_string(header=True, float_format="{:.3f}".format, na_rep=""),
+    )
+
+
+def _read_agent(trained: TrainingSettings, run: Path, checkpoint: Name) -> Agent:
+    loss = make_loss(trained, "cpu")
+    average = make_average(loss, trained.learner)
+    for damaged in load_weights(run / CHECKPOINTS, checkpoint, loss=loss, average=average):
+        print(f"rcdsac_trl: {damaged}", file=sys.stderr)
+    return Agent(packed(average.module), packed_loss(loss))
+
+
+def _trained(settings: EvaluationSettings) -> TrainingSettings:
+    if settings.run is not None:
+        return settings_of_run(Path(settings.run))
+    # A baseline drives in training's default world; which agent would be trained there does not matter.
+    return training_settings(compose("train", ["+algo=sac"]))
+
+
+def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, num_conditions: int) -> WorldSettings:
+    sensor = settings.sensor or trained.sensor
+    if settings.run is not None and sensor != trained.sensor:
+        raise UserInputError(
+            f"sensor={sensor.name} does not fit: {settings.run} was trained with sensor={trained.sensor.name}, "
+            "leave it out"
+        )
+    return WorldSettings(
+        map_settings=settings.map or trained.map,
+        task=settings.task or trained.task,
+        sensor=sensor.name,
+        num_agents=settings.num_episodes * num_conditions,
+        num_workers=0,  # a process drives whole maps
+        gui=settings.gui,
+    )

@@ -1,0 +1,103 @@
+"""Baselines by name: what ``baseline=`` of an evaluation may be."""
+
+import importlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import waypoint_observation
+from rcdsac_trl.robot.range_sensor import NUM_BINS, sensor_mask
+from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
+from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
+from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
+from rcdsac_trl.rollout.policies import PursuitPolicy
+
+PURSUIT = "pursuit"
+_PLANNERS: Mapping[str, Callable[[], Controller]] = {"dwa": Dwa, "mppi": Mppi}
+_SETTINGS: Mapping[str, Callable[[], Any]] = {"dwa": DwaSettings, "mppi": MppiSettings}
+_OWN = re.compile(r"(?P<module>\w+(\.\w+)*):(?P<name>\w+)")
+
+
+def baseline_policy(name: str, *, sensor: str, agent_ids: Sequence[int], seed: int) -> TensorDictModuleBase:
+    """Return the policy of a baseline.
+
+    Args:
+        name: ``pursuit``, ``dwa``, ``mppi``, or ``<module>:<class>``, a class as
+            :class:`rcdsac_trl.rollout.planners.controller.Controller` describes it.
+        sensor: one of :data:`rcdsac_trl.robot.range_sensor.SENSORS`.
+        agent_ids: numbers of the agents.
+        seed: root seed of what is random.
+
+    Raises:
+        UserInputError: if there is no such baseline.
+    """
+    if name == PURSUIT:
+        return PursuitPolicy()
+    make = _PLANNERS.get(name) or _own_class(name)
+    return ControllerPolicy(make, name, sensor_mask(sensor), agent_ids, seed)
+
+
+def check_baseline(name: str, sensor: str) -> None:
+    """Refuse a baseline that cannot drive: let it drive one step with nothing around.
+
+    Raises:
+        UserInputError: if there is no such baseline, it cannot be made, or it answers no two velocities.
+    """
+    policy = baseline_policy(name, sensor=sensor, agent_ids=[0], seed=0)
+    if name == PURSUIT or name in _PLANNERS:
+        return
+    ahead = waypoint_observation((0.0, 0.0, 0.0), (5.0, 0.0), (5.0, 0.0))
+    seen = {
+        "range": torch.zeros(1, NUM_BINS),
+        "waypoint": torch.tensor([ahead]),
+        "velocity": torch.zeros(1, 4),
+        "is_init": torch.ones(1, 1, dtype=torch.bool),
+    }
+    try:
+        policy(TensorDict(seen, [1]))
+    except UserInputError:
+        raise
+    except Exception as error:
+        raise _failed(name, "drive a first step", error) from error
+
+
+def settings_of(name: str) -> dict[str, Any]:
+    """Return what one of our planners looks at and what counts for it; empty for others."""
+    return {"baseline": asdict(_SETTINGS[name]())} if name in _SETTINGS else {}
+
+
+def _own_class(name: str) -> Callable[[], Controller]:
+    """Return what makes a user's controller, after it has made one."""
+    match = _OWN.fullmatch(name)
+    if match is None:
+        raise UserInputError(
+            f"baseline={name} is unknown: choose one of {', '.join([PURSUIT, *_PLANNERS])}, or <module>:<class>"
+        )
+    try:
+        module = importlib.import_module(match["module"])
+    except Exception as error:
+        raise _failed(name, f"import {match['module']}", error) from error
+    make: Any = getattr(module, match["name"], None)
+    if make is None:
+        raise UserInputError(f"baseline={name}: module {match['module']} has no {match['name']}")
+    try:
+        made = make()
+    except Exception as error:
+        raise _failed(name, f"call {match['name']}() without arguments", error) from error
+    lacking = [method for method in ("reset", "act") if not callable(getattr(made, method, None))]
+    if lacking:
+        raise UserInputError(
+            f"baseline={name} has no {lacking[0]}(): a controller has reset(sensed, rng) and "
+            "act(ranges_m, waypoints_m, velocity)"
+        )
+    return make
+
+
+def _failed(name: str, tried: str, error: Exception) -> UserInputError:
+    return UserInputError(f"baseline={name}: cannot {tried}: {type(error).__name__}: {error}")

@@ -1,0 +1,145 @@
+"""What a hand-written controller is, and a policy that drives every agent of a batch with one of its own."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
+from rcdsac_trl.robot.observation import range_distances
+from rcdsac_trl.seeding import stream
+
+
+class Controller(Protocol):
+    """Drives one robot with what an agent is told, decoded to metres: no pose, no map.
+
+    A class whose objects are made without arguments and have these two methods can be evaluated with
+    ``baseline=<module>:<class>``.
+    """
+
+    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
+        """Begin an episode, and forget the last one.
+
+        Args:
+            sensed: which of the 180 sectors the sensor has, bool [180]; sector i (from 0) covers [2i, 2i + 2) degrees
+                counter-clockwise from straight ahead.
+            rng: the only source of randomness to use; results repeat then.
+        """
+        ...
+
+    def act(
+        self, ranges_m: NDArray[np.float64], waypoints_m: NDArray[np.float64], velocity: NDArray[np.float64]
+    ) -> tuple[float, float]:
+        """Return the desired velocities: linear in m/s and angular in rad/s; what is beyond the robot's is clipped.
+
+        Args:
+            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m and
+                where the sensor has no sector.
+            waypoints_m: the next two waypoints, float64 [2, 2], x ahead and y to the left, m; both are the goal on
+                the last leg.
+            velocity: linear and angular velocity measured, then those desired last, float64 [4], m/s and rad/s.
+        """
+        ...
+
+
+class ControllerPolicy(TensorDictModuleBase):
+    """Drives each agent with a controller of its own, so that none depends on which others there are.
+
+    Args:
+        make: makes a controller.
+        name: of the controller, for messages and as the purpose of its random streams.
+        sensed: which of the 180 sectors the sensor has, bool [180].
+        agent_ids: numbers of the agents, in the order of the flattened batch.
+        seed: root seed; agent j on map i draws from the stream (seed, name, i, j).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from rcdsac_trl.robot.range_sensor import sensor_mask
+        >>> from rcdsac_trl.rollout.planners.dwa import Dwa
+        >>> policy = ControllerPolicy(Dwa, "dwa", sensor_mask("narrow"), agent_ids=[0], seed=0)
+        >>> ahead = torch.tensor([[1.0, 1.0, 0.0, 1.0, 1.0, 0.0]])
+        >>> seen = {"range": torch.zeros(1, 180), "waypoint": ahead, "velocity": torch.zeros(1, 4)}
+        >>> policy(TensorDict({**seen, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1]))["action"]
+        tensor([[1., 0.]])
+    """
+
+    in_keys = ["range", "waypoint", "velocity", "is_init"]  # noqa: RUF012 (TensorDictModuleBase's own form)
+    out_keys = ["action"]  # noqa: RUF012
+
+    def __init__(
+        self,
+        make: Callable[[], Controller],
+        name: str,
+        sensed: NDArray[np.bool_],
+        agent_ids: Sequence[int],
+        seed: int,
+    ) -> None:
+        super().__init__()
+        self._name = name
+        self._sensed = sensed
+        self._agent_ids = tuple(agent_ids)
+        self._seed = seed
+        self._map_index = 0
+        self._controllers = [make() for _ in self._agent_ids]
+
+    def set_map(self, map_index: int) -> None:
+        """Choose the random streams of the episodes that begin from now on."""
+        self._map_index = map_index
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`.
+
+        Raises:
+            UserInputError: if a controller returns something else than two finite numbers.
+        """
+
+        def rows(key: str) -> NDArray:
+            value = tensordict.get(key)
+            return value.reshape(-1, value.shape[-1]).numpy()
+
+        ranges_m = range_distances(rows("range"))
+        waypoints_m = waypoint_positions(rows("waypoint"))
+        velocities = rows("velocity").astype(np.float64)
+        is_init = rows("is_init")[:, 0]
+        actions = np.empty((len(self._controllers), 2), np.float32)
+        for row, controller in enumerate(self._controllers):
+            if is_init[row]:
+                controller.reset(self._sensed, stream(self._seed, self._name, self._map_index, self._agent_ids[row]))
+            actions[row] = self._action(controller.act(ranges_m[row], waypoints_m[row], velocities[row]))
+        return tensordict.set("action", torch.from_numpy(actions).view(*tensordict.batch_size, -1))
+
+    def _action(self, answer: object) -> tuple[float, float]:
+        """Return the action of desired velocities; undoes :func:`rcdsac_trl.robot.action.desired_velocities`."""
+        try:
+            v, omega = (float(value) for value in answer)  # type: ignore[attr-defined]
+        except (TypeError, ValueError):
+            v = omega = math.nan
+        if not (math.isfinite(v) and math.isfinite(omega)):
+            raise UserInputError(
+                f"baseline={self._name} answered {answer!r}: act() must return the desired velocities, two finite "
+                "numbers in m/s and rad/s"
+            )
+        v = min(max(v, MIN_LINEAR_VELOCITY), MAX_LINEAR_VELOCITY)
+        omega = min(max(omega, -MAX_ANGULAR_VELOCITY), MAX_ANGULAR_VELOCITY)
+        share = (v - MIN_LINEAR_VELOCITY) / (MAX_LINEAR_VELOCITY - MIN_LINEAR_VELOCITY)
+        return 2.0 * share - 1.0, omega / MAX_ANGULAR_VELOCITY
+
+
+def waypoint_positions(observed: NDArray) -> NDArray[np.float64]:
+    """Return where waypoints are, float64 [N, 2, 2], in the robot's frame, m.
+
+    Args:
+        observed: o_waypoint, [N, 6]; see :func:`rcdsac_trl.robot.observation.waypoint_observation`.
+
+    Example:
+        >>> waypoint_positions(np.array([[1.0, 1.0, 0.0, 2.0, 0.0, 1.0]])).tolist()
+        [[[10.0, 0.0], [0.0, 100.0]]]
+    """
+    each = np.asarray(observed, np.float64).reshape(-1, 2, 3)
+    return 10.0 ** each[..., :1] * each[..., 1:]

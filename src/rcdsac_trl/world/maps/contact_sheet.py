@@ -1,0 +1,94 @@
+"""Maps on a contact sheet, each with one start and goal and the paths between them."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon
+
+from rcdsac_trl.seeding import stream
+from rcdsac_trl.world.maps.generator import Map, MapSettings, Split, generate_map
+from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
+from rcdsac_trl.world.maps.planner import Planner
+
+_FLOOR = "#f7f5f0"
+_WALL = "#3d4450"
+_MAPPED = "#8d99ae"
+_UNMAPPED = "#e07a3f"
+_MOVER = "#7b4fa3"
+_START = "#2a9d5c"
+_GOAL = "#d62839"
+_WAYPOINTS = "#1d6fd1"
+_TRUE_PATH = "#2b2b2b"
+_PANEL_INCHES = 3.6
+_DOTS = (0, (1.0, 1.2))
+
+
+def contact_sheet(settings: MapSettings, split: Split, seed: int, count: int) -> Figure:
+    """Return a figure with the first maps of a family.
+
+    Args:
+        settings: of the maps.
+        split: which family.
+        seed: the root seed of the maps, starts and goals.
+        count: how many maps.
+    """
+    columns = min(count, 4)
+    rows = -(-count // columns)
+    size = (columns * _PANEL_INCHES, rows * (_PANEL_INCHES + 0.25) + 0.7)
+    figure = Figure(figsize=size, layout="constrained")
+    for index in range(count):
+        map_ = generate_map(settings, split, seed, index)
+        axes = figure.add_subplot(rows, columns, index + 1)
+        axes.set_title(f"{split} {index} · {map_.layout}", fontsize=9, color=_WALL)
+        draw_map(axes, map_, Planner(map_), stream(seed, f"draw/{split}", index))
+    figure.legend(handles=_legend(), loc="outside lower center", ncols=2 * min(columns, 2), frameon=False)
+    return figure
+
+
+def draw_map(axes: Axes, map: Map, planner: Planner, rng: np.random.Generator) -> None:
+    """Draw one map, with a start and a goal and the paths between them.
+
+    Args:
+        axes: where to draw.
+        map: the map.
+        planner: the map's planner.
+        rng: draws start, goal and the movers' places.
+    """
+    axes.set(xlim=(0, map.size_m), ylim=(0, map.size_m), aspect="equal", xticks=[], yticks=[])
+    axes.set_facecolor(_FLOOR)
+    axes.spines[:].set_visible(False)
+    for box in map.boxes:
+        color = _WALL if box.wall else _MAPPED if box.mapped else _UNMAPPED
+        axes.add_patch(Polygon(box.corners(), facecolor=color))
+    for cylinder in map.cylinders:
+        color = _MAPPED if cylinder.mapped else _UNMAPPED
+        axes.add_patch(Circle((cylinder.x, cylinder.y), cylinder.radius, facecolor=color))
+    for mover in map.movers:
+        x, y = planner.sample_mover_point(rng)
+        axes.add_patch(Circle((x, y), mover.radius, facecolor=_MOVER, edgecolor="white", linewidth=0.6))
+    start = planner.sample_free(rng)
+    # Half the map's size away, so that the path shows something of the place.
+    goal = planner.sample_goal(rng, start, map.size_m / 2)
+    true_path = np.vstack([start, planner.true_path(start, goal)])
+    waypoints = np.vstack([start, planner.waypoints(start, goal)])
+    axes.plot(*true_path.T, color=_TRUE_PATH, linewidth=1.1, linestyle=_DOTS)
+    axes.plot(*waypoints.T, color=_WAYPOINTS, linewidth=1.3, marker="o", markersize=3)
+    axes.add_patch(Circle((start[0], start[1]), ROBOT_RADIUS_M, facecolor=_START, zorder=3))
+    axes.plot(*goal, color=_GOAL, marker="*", markersize=10, markeredgecolor="white", markeredgewidth=0.6)
+
+
+def _legend() -> list[Patch | Line2D]:
+    def dot(color: str, marker: str, label: str, size: float = 8) -> Line2D:
+        return Line2D([], [], color=color, marker=marker, linestyle="", markersize=size, label=label)
+
+    return [
+        Patch(color=_WALL, label="wall"),
+        Patch(color=_MAPPED, label="clutter, mapped"),
+        Patch(color=_UNMAPPED, label="clutter, unmapped"),
+        dot(_MOVER, "o", "mover"),
+        dot(_START, "o", "start"),
+        dot(_GOAL, "*", "goal", 11),
+        Line2D([], [], color=_WAYPOINTS, marker="o", markersize=3, label="waypoints (what the planner knows)"),
+        Line2D([], [], color=_TRUE_PATH, linestyle=_DOTS, label="true shortest path"),
+    ]

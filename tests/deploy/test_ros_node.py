@@ -1,0 +1,196 @@
+"""The ROS node on a stand-in for rclpy: what it reads, writes and tells. ROS itself cannot be installed here."""
+
+import importlib
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+from test_robot_driver import laser, odometry, path
+
+from rcdsac_trl.deploy.policy.weights import packed
+from robots import agent
+
+
+class Node:
+    """What the node uses of ``rclpy.node.Node``; parameters that are set at the start, and a clock that stands."""
+
+    given: dict[str, Any]
+    endpoints: dict[str, list[str]]
+
+    def __init__(self, name: str) -> None:
+        self.parameters: dict[str, Any] = {}
+        self.subscriptions: dict[str, Any] = {}
+        self.published: list[Any] = []
+        self.publishers: dict[str, Any] = {}
+        self.timers: list[Any] = []
+        self.told: list[str] = []
+
+    def declare_parameter(self, name: str, default: Any) -> Any:
+        self.parameters[name] = SimpleNamespace(name=name, value=self.given.get(name, default))
+        return self.parameters[name]
+
+    def get_parameter(self, name: str) -> Any:
+        return self.parameters[name]
+
+    def add_on_set_parameters_callback(self, callback: Any) -> None:
+        self.set = callback
+
+    def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
+        self.subscriptions[topic] = callback
+
+    def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
+        self.publishers[topic] = kind
+        return SimpleNamespace(publish=self.published.append)
+
+    def create_timer(self, period_s: float, callback: Any) -> None:
+        self.timers.append(callback)
+
+    def get_clock(self) -> Any:
+        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=10_000_000_000))
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(warning=self.told.append, info=self.told.append)
+
+    def get_subscriptions_info_by_topic(self, topic: str) -> list[Any]:
+        return [SimpleNamespace(topic_type=kind) for kind in self.endpoints.get(topic, [])]
+
+    get_publishers_info_by_topic = get_subscriptions_info_by_topic
+
+    def destroy_node(self) -> None:
+        """There is nothing to destroy."""
+
+
+def vector() -> SimpleNamespace:
+    return SimpleNamespace(x=0.0, y=0.0, z=0.0)
+
+
+class Twist:
+    def __init__(self) -> None:
+        self.linear, self.angular = vector(), vector()
+
+
+class TwistStamped:
+    def __init__(self) -> None:
+        self.header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
+        self.twist = Twist()
+
+
+@pytest.fixture
+def ros_node(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
+    """Import the node with stand-ins for ROS's packages; it drives an agent that is written for it."""
+    for name, content in packed(agent()).items():
+        (tmp_path / name).write_bytes(content)
+    Node.given, Node.endpoints = {"agent": str(tmp_path)}, {}
+    contents: dict[str, dict[str, Any]] = {
+        "rclpy": {"init": lambda: None, "try_shutdown": lambda: None, "spin": lambda node: node.timers[0]()},
+        "rclpy.node": {"Node": Node},
+        "rclpy.parameter": {"Parameter": SimpleNamespace},
+        "rclpy.qos": {"qos_profile_sensor_data": 5},
+        "rcl_interfaces.msg": {"SetParametersResult": SimpleNamespace},
+        "geometry_msgs.msg": {"Twist": Twist, "TwistStamped": TwistStamped},
+        "nav_msgs.msg": {"Odometry": object, "Path": object},
+        "sensor_msgs.msg": {"LaserScan": object},
+        "std_msgs.msg": {"Float32MultiArray": SimpleNamespace},
+    }
+    for name, members in contents.items():
+        module = ModuleType(name)
+        module.__dict__.update(members)
+        monkeypatch.setitem(sys.modules, name, module)
+        if "." in name:
+            monkeypatch.setitem(sys.modules, name.split(".")[0], sys.modules.get(name.split(".")[0], ModuleType(name)))
+    yield importlib.import_module("rcdsac_trl.deploy.ros_node")
+    sys.modules.pop("rcdsac_trl.deploy.ros_node")
+
+
+def driven(node: Any, ranges: Any = None) -> Any:
+    """Give a node what it needs, let its timer fire, and return the command it published."""
+    node.subscriptions["scan"](laser(10.0, ranges))
+    node.subscriptions["odom"](odometry(10.0, 0.0, 0.0))
+    node.subscriptions["plan"](path([(0.0, 0.0), (5.0, 0.0)]))
+    node.published.clear()
+    node.timers[0]()
+    return node.published[0]
+
+
+def test_it_drives_and_writes_stamped_or_plain_twists(ros_node: Any) -> None:
+    stamped_node = ros_node.PolicyNode()
+    stamped = driven(stamped_node)
+    assert stamped_node.publishers["cmd_vel"] is TwistStamped
+    assert (stamped.header.stamp.sec, stamped.header.frame_id) == (10, "base_link")
+    assert stamped_node.told == []
+    assert len(stamped_node.published) == 2  # and the quantiles
+    Node.given["command_type"] = "Twist"
+    node = ros_node.PolicyNode()
+    plain = driven(node)
+    assert (node.publishers["cmd_vel"], type(plain)) == (Twist, Twist)
+    assert (plain.linear.x, plain.angular.z) == (stamped.twist.linear.x, stamped.twist.angular.z) != (0.0, 0.0)
+
+
+def test_parameters_are_live_and_zeros_mean_what_is_said(ros_node: Any) -> None:
+    node = ros_node.PolicyNode()
+    assert node.driver.beta is None
+    node.set([SimpleNamespace(name="beta", value=-2.0), SimpleNamespace(name="stop", value=True)])
+    assert node.driver.beta == -2.0
+    assert driven(node).twist.linear.x == 0.0
+    assert "stop() was called" in node.told[-1]
+    node.set([SimpleNamespace(name="beta", value=math.nan), SimpleNamespace(name="stop", value=False)])
+    assert node.driver.beta is None
+    driven(node, [0.0] * 360)
+    assert "set zero_means='nothing'" in node.told[-1]
+    Node.given["zero_means"] = "nothing"
+    node = ros_node.PolicyNode()
+    driven(node, [0.0] * 360)
+    assert node.told == []
+
+
+def test_it_tells_who_reads_its_commands_whenever_that_changes(ros_node: Any) -> None:
+    node = ros_node.PolicyNode()
+    report = node.timers[1]
+    report()
+    report()
+    assert len(node.told) == 1
+    assert node.told[0].startswith(
+        "nobody reads cmd_vel (written as geometry_msgs/msg/TwistStamped); nobody writes scan"
+    )
+    needed = {"scan": "sensor_msgs/msg/LaserScan", "odom": "nav_msgs/msg/Odometry", "plan": "nav_msgs/msg/Path"}
+    Node.endpoints = {topic: [kind] for topic, kind in needed.items()} | {"cmd_vel": ["geometry_msgs/msg/Twist"]}
+    report()
+    assert node.told[1] == (
+        "cmd_vel is read as geometry_msgs/msg/Twist, and written as geometry_msgs/msg/TwistStamped; the parameter "
+        "command_type chooses another of TwistStamped, Twist"
+    )
+    Node.endpoints["cmd_vel"] = ["geometry_msgs/msg/TwistStamped"]
+    report()
+    assert node.told[2] == "cmd_vel is read as geometry_msgs/msg/TwistStamped"
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"command_type": "twist"}, "command_type=twist is not one of TwistStamped, Twist"),
+        ({"zero_means": "open"}, "zero_means='open' is neither"),
+        ({"laser_x_m": 150.0}, "x_m=150, y_m=0 is more than 1 m from the robot's centre: give metres"),
+        ({"agent": "nobody"}, "there is no agent 'nobody'"),
+    ],
+)
+def test_wrong_parameters_end_in_one_sentence(
+    ros_node: Any, given: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Node.given |= given
+    with pytest.raises(SystemExit, match="2"):
+        ros_node.main()
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+
+
+def test_the_program_spins_and_leaves_ros(ros_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(Node, "destroy_node", lambda node: done.append(node.told[-1]))
+    monkeypatch.setattr(ros_node.rclpy, "try_shutdown", lambda: done.append("left"))
+    ros_node.main()
+    assert done == ["there is no odometry yet; it drives on with the next good input", "left"]
