@@ -264,7 +264,7 @@ def test_read_refuses_in_one_sentence(changes: dict[str, Any], sentence: str) ->
 
 # ------------------------------------------------------------------------------------------------ no dead keys
 # Read by __post_init__ alone, because all it is for is to be refused; and decided upon before settings are made.
-ONLY_CHECKED = {("MapSettings", "version"), ("TrainingSettings", "resume")}
+ONLY_CHECKED = {("MapSettings", "version"), ("TaskSettings", "version"), ("TrainingSettings", "resume")}
 PLUMBING = {"__post_init__", "__eq__", "__hash__", "__repr__", "_asdict_inner"}
 
 

@@ -30,10 +30,10 @@ class QuantilePredictor:
     def __init__(
         self, critics: Sequence[TensorDictSequential], rows: Sequence[int], num_quantiles: int = NUM_QUANTILES
     ) -> None:
-        self.rows = torch.tensor(list(rows))
+        self.rows = torch.tensor(list(rows), device="cpu")
         self._critics = critics
         self._tau = torch.from_numpy(fractions_of(num_quantiles)).expand(len(rows), 1, -1)
-        self._states = [torch.zeros(len(rows), critic[0].module.state_size) for critic in critics]
+        self._states = [self._tau.new_zeros(len(rows), critic[0].module.state_size) for critic in critics]
 
     def step(self, tensordict: TensorDictBase) -> Tensor:
         """Return the quantiles ``[R, N]`` of each agent's return from its action on.
