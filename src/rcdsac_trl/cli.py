@@ -17,7 +17,7 @@ from rcdsac_trl.config.compose import combinations, compose, output_folder
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.system.resources import fault_sentence
-from rcdsac_trl.system.runtime import bound_threads, keep_pages, let_workers_rest, quiet_libraries
+from rcdsac_trl.system.runtime import bound_threads, keep_pages, let_workers_rest, quiet_libraries, speak_anywhere
 
 Task = Callable[[DictConfig], None]
 
@@ -154,6 +154,7 @@ def _program(start: Callable[[], None]) -> None:
         keep_pages()
         quiet_libraries()
         let_workers_rest()
+        speak_anywhere()
         start()
     except KeyboardInterrupt:
         print("rcdsac_trl: interrupted", file=sys.stderr)

@@ -158,7 +158,7 @@ def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFr
 
 def write_calibration(folder: Path) -> str:
     """Write ``calibration.csv`` and ``.png`` of a folder that ``calibrate`` wrote; return the table as text."""
-    described = json.loads((folder / "calibration.json").read_text())
+    described = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
     predictions, returns = (pd.read_csv(folder / f"{name}.csv") for name in ("predictions", "returns"))
     table = calibration_table(predictions, returns, described["gamma"], described["horizon_steps"])
     table.to_csv(folder / "calibration.csv", index=False, float_format="%.6g")

@@ -103,8 +103,8 @@ def write_course(folder: Path) -> str:
     runs, traces = (pd.read_csv(folder / f"{name}.csv") for name in ("runs", "traces"))
     table = course_table(runs)
     table.to_csv(folder / "table.csv", index=False)
-    (folder / "table.md").write_text(markdown(table))
-    office = json.loads((folder / "office.json").read_text())
+    (folder / "table.md").write_text(markdown(table), encoding="utf-8")
+    office = json.loads((folder / "office.json").read_text(encoding="utf-8"))
     course_figure(runs, traces, office).savefig(folder / "course.png", dpi=110)
     return str(table.set_index(["run", "agent", "ψ", "β"]).T.to_string())
 

@@ -99,7 +99,7 @@ def read_evaluation(folder: Path) -> Evaluation:
         UserInputError: if it is incomplete, or of a version that described less.
     """
     try:
-        described = json.loads((folder / DESCRIPTION).read_text())
+        described = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
         episodes = pd.read_csv(folder / "episodes.csv")
         missing = {*_PROTOCOL, "agent", "sensor"} - set(described)
         missing |= {"beta", "collision_weight", "map", "episode", "collisions", "reward"} - set(episodes)

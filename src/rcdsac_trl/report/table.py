@@ -113,10 +113,10 @@ def write_table(table: pd.DataFrame, stem: Path) -> None:
         stem: the files' path without suffix.
     """
     flat = flattened(table)
-    stem.with_suffix(".csv").write_text(flat.to_csv(index=False))
-    stem.with_suffix(".md").write_text(markdown(flat))
-    stem.with_suffix(".tex").write_text(latex(table))
-    stem.with_suffix(".html").write_text(html(table))
+    stem.with_suffix(".csv").write_text(flat.to_csv(index=False), encoding="utf-8")
+    stem.with_suffix(".md").write_text(markdown(flat), encoding="utf-8")
+    stem.with_suffix(".tex").write_text(latex(table), encoding="utf-8")
+    stem.with_suffix(".html").write_text(html(table), encoding="utf-8")
 
 
 def flattened(table: pd.DataFrame) -> pd.DataFrame:

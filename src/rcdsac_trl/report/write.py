@@ -46,7 +46,7 @@ def write_report(episodes: Episodes, folders: Sequence[Path], out: Path) -> None
     for name, figure in figures.items():
         figure.savefig(out / f"{name}.png", dpi=130)
     sections = _sections(episodes, paper, summary, pairs, trends, means, turned, figures)
-    (out / "report.html").write_text(page("What was found", sections))
+    (out / "report.html").write_text(page("What was found", sections), encoding="utf-8")
 
 
 def _own_averages(episodes: Episodes) -> pd.DataFrame:

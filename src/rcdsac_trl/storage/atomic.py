@@ -121,7 +121,7 @@ class FolderLock:
 
     def __init__(self, folder: Path, name: str = "lock") -> None:
         try:
-            self._file = (folder / name).open("a")
+            self._file = (folder / name).open("a", encoding="utf-8")
         except OSError as error:
             raise UserInputError(f"{folder / name} cannot be opened ({error.strerror}): remove it") from error
         try:

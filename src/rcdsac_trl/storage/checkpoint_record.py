@@ -179,7 +179,7 @@ def write_record(folder: Path, progress: Progress, segments: Sequence[Segment], 
         "files": {name: durable.sha256_of(folder / name) for name in _files(folder)},
     }
     written = {"format_version": FORMAT_VERSION, "sha256": _digest(FORMAT_VERSION, content), **content}
-    (folder / _RECORD).write_text(json.dumps(written, indent=1) + "\n")
+    (folder / _RECORD).write_text(json.dumps(written, indent=1) + "\n", encoding="utf-8")
 
 
 def record(path: Path) -> Saved:

@@ -56,7 +56,7 @@ class ResultsFolder:
     def _holds_another(self) -> bool:
         """Say whether the folder's description is of something else; one that cannot be read is."""
         try:
-            return _without_commit(self._description.read_text()) != _without_commit(self.described)
+            return _without_commit(self._description.read_text(encoding="utf-8")) != _without_commit(self.described)
         except (OSError, ValueError, AttributeError, RecursionError):
             return True
 

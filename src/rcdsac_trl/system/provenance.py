@@ -13,6 +13,7 @@ def commit() -> str:
             cwd=here,
             capture_output=True,
             text=True,
+            encoding="utf-8",
             check=True,
             timeout=10,
         )

@@ -102,7 +102,7 @@ def available_memory_bytes(system: Path = cgroups.SYSTEM) -> int | None:
     """
     found = []
     with suppress(OSError, KeyError, ValueError):
-        lines = dict(line.split(":", 1) for line in (system / "proc/meminfo").read_text().splitlines())
+        lines = dict(line.split(":", 1) for line in (system / "proc/meminfo").read_text(encoding="utf-8").splitlines())
         found.append(sum(int(lines[key].split()[0]) for key in ("MemAvailable", "SwapFree")) * 1024)
     if (room := cgroups.memory_room_bytes(system)) is not None:
         found.append(room)

@@ -3,6 +3,7 @@
 This module is imported before torch, so that a re-executed process has paid nothing twice.
 """
 
+import io
 import os
 import re
 import sys
@@ -59,6 +60,13 @@ def _has_glibc() -> bool:
 def quiet_libraries() -> None:
     """Keep TorchRL's own notes (every storage it makes) out of the user's log, unless they ask for them."""
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+
+def speak_anywhere() -> None:
+    """Let what a program prints reach a terminal that has no letter for it, such as a β where the locale is C."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def let_workers_rest() -> None:

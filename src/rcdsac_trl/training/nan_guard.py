@@ -108,7 +108,7 @@ class FiniteGuard:
                 "batch_size": list(batch.batch_size),
                 "distortion_strength": self.loss.distortion_strength,
             }
-            (temporary / "failure.json").write_text(json.dumps(described, indent=2) + "\n")
+            (temporary / "failure.json").write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
             atomic.publish(folder)
         raise TrainingError(
             f"{what} is NaN or infinite in iteration {self._iteration}: training stops; {folder} shows it again, "
@@ -125,7 +125,7 @@ def load_failure(folder: Path, loss: LossModule) -> TensorDict:
     """
     Checkpoint(loss=loss).load(folder / _WEIGHTS, map_location="cpu")
     tensors = safetensors.torch.load_file(folder / _BATCH)
-    described = json.loads((folder / "failure.json").read_text())
+    described = json.loads((folder / "failure.json").read_text(encoding="utf-8"))
     loss.distortion_strength = described["distortion_strength"]
     size = described["batch_size"]
     keyed = {tuple(name.split(".")): value.expand(*size, *value.shape[len(size) :]) for name, value in tensors.items()}

@@ -124,7 +124,7 @@ class RunLog:
         self._loggers: list[Logger] = [
             get_logger(name, logger_name=str(folder), experiment_name=name) for name in backends
         ]
-        self._file = (folder / "train.log").open("a", buffering=1)
+        self._file = (folder / "train.log").open("a", buffering=1, encoding="utf-8")
         self._excepthook = threading.excepthook
         threading.excepthook = self._thread_failed
         for logger in self._loggers:
