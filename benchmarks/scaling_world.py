@@ -55,7 +55,9 @@ def scaling() -> dict[str, dict[float, float]]:
     from rcdsac_trl.world.task.env import make_env
 
     agents: dict[float, Any] = {n: make_env(agent_ids=range(n), num_workers=0) for n in AGENTS}
-    clutter = {density: make_env(MapSettings(clutter_per_m2=density), num_workers=0) for density in CLUTTER_PER_M2}
+    clutter = {
+        density: make_env(map_settings=MapSettings(clutter_per_m2=density), num_workers=0) for density in CLUTTER_PER_M2
+    }
     return {
         "agents": rates(agents, bench.cpu_seconds),
         "workers": rates({n: make_env(num_workers=n) for n in WORKERS}, bench.wall_seconds),

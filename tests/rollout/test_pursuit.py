@@ -45,7 +45,7 @@ def test_it_works_on_any_batch_and_looks_at_the_next_waypoint_alone() -> None:
 
 def test_it_reaches_goals_without_a_collision_where_nothing_stands() -> None:
     empty = MapSettings(size_m=12.0, layouts=("clutter",), clutter_per_m2=0.0, num_movers=0)
-    env = NavigationEnv(empty, agent_ids=tuple(range(4)))
+    env = NavigationEnv(map_settings=empty, agent_ids=tuple(range(4)))
     tensordict = env.reset()
     goals, collisions, speed = torch.zeros(4), torch.zeros(4), torch.zeros(4)
     for _ in range(500):

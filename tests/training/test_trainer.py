@@ -800,7 +800,7 @@ def test_each_iteration_is_one_new_map_and_an_episode_of_every_agent(tmp_path: P
     for iteration in range(ITERATIONS):
         batch = trainer.episodes.collect(iteration, iteration)
         assert batch.batch_size == torch.Size([AGENTS, STEPS])
-        fresh = NavigationEnv(settings.map, settings.task, seed=0, agent_ids=range(AGENTS), first_episode=iteration)
+        fresh = NavigationEnv(settings.training_world, seed=0, first_episode=iteration)
         start = fresh.reset()
         for key in ("range", "waypoint", "velocity"):
             assert torch.equal(batch[key][:, 0], start[key]), key

@@ -24,7 +24,7 @@ from rcdsac_trl.world.task.gymnasium_env import NavigationGymEnv
 EMPTY = MapSettings(size_m=10.0, layouts=("clutter",), clutter_per_m2=0.0, num_movers=0)
 MOST_CLIENTS = 1024
 
-navigation_env = partial(NavigationEnv, EMPTY, agent_ids=(0, 1))
+navigation_env = partial(NavigationEnv, map_settings=EMPTY, agent_ids=(0, 1))
 
 
 def transformed_env() -> TransformedEnv:
@@ -38,7 +38,7 @@ MAKERS: dict[str, Callable[[], Any]] = {
     "torchrl": navigation_env,
     "transformed": transformed_env,
     "serial": lambda: SerialEnv(2, navigation_env),
-    "gymnasium": partial(NavigationGymEnv, EMPTY),
+    "gymnasium": partial(NavigationGymEnv, map_settings=EMPTY),
 }
 
 

@@ -50,21 +50,21 @@ def assert_equal(one: TensorDictBase, other: TensorDictBase) -> None:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_specs_hold_for_every_sensor_and_map(sensor: str, layout: str, num_movers: int) -> None:
     settings = MapSettings(size_m=12.0, layouts=(layout,), num_movers=num_movers)
-    env = NavigationEnv(settings, sensor=sensor, agent_ids=(0, 1))
+    env = NavigationEnv(map_settings=settings, sensor=sensor, agent_ids=(0, 1))
     check_env_specs(env, seed=0)
     env.close()
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_specs_hold_with_weighted_collisions(num_workers: int) -> None:
-    env = make_env(SMALL, agent_ids=(0, 1), num_workers=num_workers, weighted_collisions=True, serial=True)
+    env = make_env(map_settings=SMALL, agent_ids=(0, 1), num_workers=num_workers, weighted_collisions=True, serial=True)
     check_env_specs(env)
     assert env.observation_spec["collision_weight"].shape == (*env.batch_size, 1)
     env.close()
 
 
 def test_keys_have_the_shapes_and_types_of_the_design_table() -> None:
-    env = NavigationEnv(SMALL, agent_ids=(3, 4))
+    env = NavigationEnv(map_settings=SMALL, agent_ids=(3, 4))
     step = env.rollout(1)[:, 0]
     shapes = {"range": 180, "waypoint": 6, "velocity": 4, "pose": 3, "contact": 1, "goal_reached": 1}
     for key, width in shapes.items():
@@ -78,25 +78,25 @@ def test_keys_have_the_shapes_and_types_of_the_design_table() -> None:
 
 @pytest.fixture(scope="module")
 def alone() -> TensorDictBase:
-    env = NavigationEnv(SMALL, seed=3)
+    env = NavigationEnv(map_settings=SMALL, seed=3)
     driven = drive(env, 150)
     env.close()
     return driven
 
 
 def test_the_same_seed_gives_the_same_rollout_bit_for_bit(alone: TensorDictBase) -> None:
-    env = NavigationEnv(SMALL, seed=3)
+    env = NavigationEnv(map_settings=SMALL, seed=3)
     env.rollout(5)  # leaves traces in the physics engine
     env.set_seed(3)
     assert_equal(drive(env, 150), alone)
     env.close()
-    env = NavigationEnv(SMALL, seed=4)
+    env = NavigationEnv(map_settings=SMALL, seed=4)
     assert not torch.equal(drive(env, 1)["pose"], alone["pose"][:, :2])
     env.close()
 
 
 def test_an_agent_does_not_notice_who_shares_its_process(alone: TensorDictBase) -> None:
-    env = NavigationEnv(SMALL, seed=3, agent_ids=(7, 2))
+    env = NavigationEnv(map_settings=SMALL, seed=3, agent_ids=(7, 2))
     actions = torch.rand(150, 10, 2, generator=torch_stream(7, "test actions")) * 2 - 1
     tensordict = env.reset()
     for step, action in enumerate(actions[:50]):
@@ -108,7 +108,7 @@ def test_an_agent_does_not_notice_who_shares_its_process(alone: TensorDictBase) 
 
 @pytest.mark.parametrize(("num_workers", "serial"), [(5, True), (1, False), (2, False), (5, False)])
 def test_workers_change_nothing(alone: TensorDictBase, num_workers: int, serial: bool) -> None:
-    env = make_env(SMALL, seed=3, num_workers=num_workers, serial=serial)
+    env = make_env(map_settings=SMALL, seed=3, num_workers=num_workers, serial=serial)
     assert isinstance(env, SerialEnv if serial else ParallelEnv)
     assert env.batch_size == (num_workers, 10 // num_workers)
     assert_equal(drive(env, 150), alone)
@@ -130,14 +130,14 @@ def test_workers_change_nothing_over_whole_episodes(num_workers: int) -> None:
 def test_agents_and_episodes_differ(alone: TensorDictBase) -> None:
     starts = alone["pose"][:, 0]
     assert len(starts.unique(dim=0)) == 10
-    env = NavigationEnv(SMALL, seed=3)
+    env = NavigationEnv(map_settings=SMALL, seed=3)
     env.reset()
     assert not (env.reset()["pose"] == starts).all(-1).any()
     env.close()
 
 
 def test_agents_of_equal_number_meet_the_same_episode() -> None:
-    env = make_env(SMALL, agent_ids=(0, 1, 0, 1), num_workers=0)
+    env = make_env(map_settings=SMALL, agent_ids=(0, 1, 0, 1), num_workers=0)
     tensordict = env.reset()
     for key in ("range", "waypoint", "pose"):
         assert torch.equal(tensordict[key][:2], tensordict[key][2:])
@@ -147,7 +147,7 @@ def test_agents_of_equal_number_meet_the_same_episode() -> None:
 def test_splits_have_maps_of_their_own() -> None:
     scans = []
     for split in ("train", "validation", "evaluation"):
-        env = NavigationEnv(SMALL, split=split, agent_ids=(0,))
+        env = NavigationEnv(map_settings=SMALL, split=split, agent_ids=(0,))
         scans.append(env.reset()["pose"])
         env.close()
     assert len(torch.cat(scans).unique(dim=0)) == 3
@@ -168,8 +168,8 @@ def goals_met(env: NavigationEnv, steps: int, throttle: float) -> list[list[tupl
 
 
 def test_starts_and_goals_do_not_depend_on_what_the_agent_does() -> None:
-    fast = goals_met(NavigationEnv(EMPTY, seed=2, agent_ids=(0, 1, 2)), 400, throttle=1.0)
-    slow = goals_met(NavigationEnv(EMPTY, seed=2, agent_ids=(0, 1, 2)), 400, throttle=0.4)
+    fast = goals_met(NavigationEnv(map_settings=EMPTY, seed=2, agent_ids=(0, 1, 2)), 400, throttle=1.0)
+    slow = goals_met(NavigationEnv(map_settings=EMPTY, seed=2, agent_ids=(0, 1, 2)), 400, throttle=0.4)
     for quick, lazy in zip(fast, slow, strict=True):
         assert len(quick) > len(lazy) >= 2
         assert quick[: len(lazy)] == lazy
@@ -179,7 +179,9 @@ def test_starts_and_goals_do_not_depend_on_what_the_agent_does() -> None:
 
 def test_episodes_are_truncated_by_the_step_counter_and_never_terminate() -> None:
     task = TaskSettings(episode_steps=5)
-    env = TransformedEnv(NavigationEnv(SMALL, task, agent_ids=(0, 1)), StepCounter(max_steps=task.episode_steps))
+    env = TransformedEnv(
+        NavigationEnv(map_settings=SMALL, task=task, agent_ids=(0, 1)), StepCounter(max_steps=task.episode_steps)
+    )
     rollout = env.rollout(12, break_when_any_done=False)
     ends = torch.tensor([step % 5 == 4 for step in range(12)])
     assert torch.equal(rollout["next", "truncated"][..., 0], ends.expand(2, 12))
@@ -188,7 +190,7 @@ def test_episodes_are_truncated_by_the_step_counter_and_never_terminate() -> Non
     # After each end the next episode begins, on the next map and from another start.
     first = rollout["pose"][:, ::5]
     assert len(first.flatten(0, 1).unique(dim=0)) == 6
-    fresh = NavigationEnv(SMALL, task, agent_ids=(0, 1), first_episode=2)
+    fresh = NavigationEnv(map_settings=SMALL, task=task, agent_ids=(0, 1), first_episode=2)
     assert torch.equal(fresh.reset()["pose"], first[:, 2])
     env.close()
     fresh.close()
@@ -196,7 +198,7 @@ def test_episodes_are_truncated_by_the_step_counter_and_never_terminate() -> Non
 
 @pytest.mark.parametrize("num_workers", [0, 3])
 def test_a_reset_of_one_agent_leaves_the_others_alone(alone: TensorDictBase, num_workers: int) -> None:
-    env = make_env(SMALL, seed=3, agent_ids=(0, 1, 2), num_workers=num_workers, serial=True)
+    env = make_env(map_settings=SMALL, seed=3, agent_ids=(0, 1, 2), num_workers=num_workers, serial=True)
     actions = torch.rand(60, 10, 2, generator=torch_stream(7, "test actions")) * 2 - 1
     tensordict = env.reset()
     for step in range(60):
@@ -210,7 +212,7 @@ def test_a_reset_of_one_agent_leaves_the_others_alone(alone: TensorDictBase, num
     kept = tensordict.flatten()
     for key in ("range", "waypoint", "velocity", "pose"):
         assert torch.equal(kept[key][[0, 2]], alone[key][[0, 2], 60])
-    second = NavigationEnv(SMALL, seed=3, agent_ids=(1,), first_episode=1)
+    second = NavigationEnv(map_settings=SMALL, seed=3, agent_ids=(1,), first_episode=1)
     begun = second.reset().set("action", actions[30, [1]])
     assert torch.equal(second.step(begun)["next", "pose"][0], moved_on["pose"][1])
     second.close()
@@ -219,7 +221,7 @@ def test_a_reset_of_one_agent_leaves_the_others_alone(alone: TensorDictBase, num
 
 @pytest.mark.parametrize("serial", [None, True])
 def test_a_reset_can_name_its_episode(serial: bool | None) -> None:
-    env = make_env(SMALL, agent_ids=(0, 1), num_workers=2 if serial else 0, serial=bool(serial))
+    env = make_env(map_settings=SMALL, agent_ids=(0, 1), num_workers=2 if serial else 0, serial=bool(serial))
     episodes = [env.reset()["pose"] for _ in range(4)]
     assert torch.equal(env.reset(episode=1)["pose"], episodes[1])
     assert torch.equal(env.reset()["pose"], episodes[2])
@@ -229,7 +231,7 @@ def test_a_reset_can_name_its_episode(serial: bool | None) -> None:
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_collision_weight_scales_the_collision_reward_alone(num_workers: int) -> None:
     def run(weight: float, num_workers: int) -> TensorDictBase:
-        env = make_env(SMALL, seed=5, num_workers=num_workers, weighted_collisions=True)
+        env = make_env(map_settings=SMALL, seed=5, num_workers=num_workers, weighted_collisions=True)
         driven = drive(env, 120, weight)
         env.close()
         return driven
@@ -244,7 +246,7 @@ def test_a_collision_weight_scales_the_collision_reward_alone(num_workers: int) 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_reset_brings_a_collision_weight_or_one(num_workers: int) -> None:
-    env = make_env(SMALL, agent_ids=(0, 1), num_workers=num_workers, serial=True, weighted_collisions=True)
+    env = make_env(map_settings=SMALL, agent_ids=(0, 1), num_workers=num_workers, serial=True, weighted_collisions=True)
     assert (env.reset()["collision_weight"] == 1.0).all()
     brought = TensorDict({"collision_weight": torch.full((*env.batch_size, 1), 0.5)}, batch_size=env.batch_size)
     assert (env.reset(brought, set_state=False)["collision_weight"] == 0.5).all()
@@ -252,7 +254,7 @@ def test_a_reset_brings_a_collision_weight_or_one(num_workers: int) -> None:
 
 
 def test_an_action_outside_the_limits_is_refused() -> None:
-    env = NavigationEnv(SMALL, agent_ids=(0,))
+    env = NavigationEnv(map_settings=SMALL, agent_ids=(0,))
     tensordict = env.reset()
     for value in (math.nan, 1.5):
         with pytest.raises(UserInputError, match=r"in \[-1, 1\]"):
@@ -261,7 +263,7 @@ def test_an_action_outside_the_limits_is_refused() -> None:
 
 
 def test_a_step_before_the_first_reset_is_refused() -> None:
-    env = NavigationEnv(SMALL, agent_ids=(0,))
+    env = NavigationEnv(map_settings=SMALL, agent_ids=(0,))
     with pytest.raises(UserInputError, match="reset"):
         env.step(TensorDict({"action": torch.zeros(1, 2)}, batch_size=[1]))
     env.close()
@@ -282,16 +284,16 @@ def test_workers_that_cannot_share_the_agents_are_refused(num_workers: object) -
 
 def test_settings_reach_the_workers_only_if_they_are_right() -> None:
     with pytest.raises(UserInputError, match="sensor"):
-        make_env(SMALL, sensor="wide", num_workers=0)
+        make_env(map_settings=SMALL, sensor="wide", num_workers=0)
     with pytest.raises(UserInputError, match="agent_ids"):
-        make_env(SMALL, agent_ids=())
+        make_env(map_settings=SMALL, agent_ids=())
 
 
 def test_workers_leave_the_number_of_threads_alone() -> None:
     before, threads = torch.get_num_threads(), 3
     torch.set_num_threads(threads)
     try:
-        env = make_env(SMALL, agent_ids=(0, 1), num_workers=2)
+        env = make_env(map_settings=SMALL, agent_ids=(0, 1), num_workers=2)
         env.reset()
         assert torch.get_num_threads() == threads
         env.close()

@@ -65,7 +65,7 @@ def test_gymnasium_finds_the_id_in_the_package_that_it_names(made: str) -> None:
 
 @pytest.mark.parametrize("kind", [SyncVectorEnv, partial(AsyncVectorEnv, context="fork")])
 def test_without_seeds_the_worlds_of_a_vector_differ_and_can_be_met_again(kind: Callable) -> None:
-    envs = kind([partial(NavigationGymEnv, SMALL)] * 3)
+    envs = kind([partial(NavigationGymEnv, map_settings=SMALL)] * 3)
     _, infos = envs.reset()
     assert len({tuple(pose) for pose in infos["pose"].tolist()}) == 3
     # The seed that an environment drew is told, and gives its world again.
@@ -74,14 +74,14 @@ def test_without_seeds_the_worlds_of_a_vector_differ_and_can_be_met_again(kind: 
     _, from_one = envs.reset(seed=5)
     assert from_one["seed"].tolist() == [5, 6, 7]
     envs.close()
-    other = kind([partial(NavigationGymEnv, SMALL)] * 3)
+    other = kind([partial(NavigationGymEnv, map_settings=SMALL)] * 3)
     assert not np.array_equal(other.reset()[1]["pose"], infos["pose"])
     assert np.array_equal(other.reset(seed=infos["seed"].tolist())[0]["range"], again["range"])
     other.close()
 
 
 def test_a_reset_without_a_seed_goes_on_under_the_seed_that_there_is() -> None:
-    env, other = NavigationGymEnv(SMALL), NavigationGymEnv(SMALL, seed=3)
+    env, other = NavigationGymEnv(map_settings=SMALL), NavigationGymEnv(map_settings=SMALL, seed=3)
     _, first = env.reset()
     assert first["seed"] == env.np_random_seed
     _, second = env.reset()
@@ -92,7 +92,7 @@ def test_a_reset_without_a_seed_goes_on_under_the_seed_that_there_is() -> None:
     assert env.step(np.zeros(2, np.float32))[4]["episode"] == 1
     env.close()
     other.close()
-    given = NavigationGymEnv(SMALL, seed=3)
+    given = NavigationGymEnv(map_settings=SMALL, seed=3)
     assert given.reset()[1]["seed"] == given.np_random_seed == 3
     given.close()
 
@@ -100,7 +100,7 @@ def test_a_reset_without_a_seed_goes_on_under_the_seed_that_there_is() -> None:
 def test_a_generator_that_a_user_has_brought_decides_and_stays() -> None:
     seeds = []
     for _ in range(2):
-        env = NavigationGymEnv(SMALL)
+        env = NavigationGymEnv(map_settings=SMALL)
         env.np_random = np.random.default_rng(8)
         seeds.append(env.reset()[1]["seed"])
         assert env.np_random_seed == -1  # Gymnasium's sign of a generator that was brought
@@ -109,7 +109,7 @@ def test_a_generator_that_a_user_has_brought_decides_and_stays() -> None:
 
 
 def test_actions_are_drawn_by_their_own_seed() -> None:
-    env = NavigationGymEnv(SMALL)
+    env = NavigationGymEnv(map_settings=SMALL)
     drawn = []
     for _ in range(2):
         env.action_space.seed(2)
@@ -119,8 +119,8 @@ def test_actions_are_drawn_by_their_own_seed() -> None:
 
 
 def test_both_adapters_give_the_same_numbers() -> None:
-    gym_env = NavigationGymEnv(SMALL, seed=4, agent_id=2, first_episode=1)
-    torch_env = NavigationEnv(SMALL, seed=4, agent_ids=(2,), first_episode=1)
+    gym_env = NavigationGymEnv(map_settings=SMALL, seed=4, agent_id=2, first_episode=1)
+    torch_env = NavigationEnv(map_settings=SMALL, seed=4, agent_ids=(2,), first_episode=1)
     observation, _ = gym_env.reset()
     tensordict = torch_env.reset()
     rng = stream(0, "test actions")
@@ -141,7 +141,7 @@ def test_both_adapters_give_the_same_numbers() -> None:
 
 
 def test_an_episode_is_truncated_after_its_steps_and_the_next_one_differs() -> None:
-    env = NavigationGymEnv(SMALL, TaskSettings(episode_steps=3))
+    env = NavigationGymEnv(map_settings=SMALL, task=TaskSettings(episode_steps=3))
     _, first = env.reset(seed=1)
     ends = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]
@@ -156,14 +156,14 @@ def test_an_episode_is_truncated_after_its_steps_and_the_next_one_differs() -> N
 
 
 def test_frames_are_drawn_in_their_mode_only() -> None:
-    env = NavigationGymEnv(SMALL, render_mode="rgb_array")
+    env = NavigationGymEnv(map_settings=SMALL, render_mode="rgb_array")
     env.reset()
     frame = env.render()
     assert frame is not None
     assert frame.dtype == np.uint8
     assert frame.ndim == 3
     env.close()
-    silent = NavigationGymEnv(SMALL)
+    silent = NavigationGymEnv(map_settings=SMALL)
     silent.reset()
     assert silent.render() is None
     silent.close()
@@ -171,8 +171,8 @@ def test_frames_are_drawn_in_their_mode_only() -> None:
 
 def test_wrong_input_is_refused() -> None:
     with pytest.raises(UserInputError, match="render_mode"):
-        NavigationGymEnv(SMALL, render_mode="human")
-    env = NavigationGymEnv(SMALL)
+        NavigationGymEnv(map_settings=SMALL, render_mode="human")
+    env = NavigationGymEnv(map_settings=SMALL)
     env.reset()
     with pytest.raises(UserInputError, match=r"in \[-1, 1\]"):
         env.step(np.array([0.0, 2.0], np.float32))

@@ -92,7 +92,7 @@ def test_edges_are_smooth() -> None:
 
 def test_the_environment_draws_its_agents() -> None:
     settings = MapSettings(size_m=12.0, layouts=("rooms",))
-    env = NavigationEnv(settings, agent_ids=(0, 1))
+    env = NavigationEnv(map_settings=settings, agent_ids=(0, 1))
     env.reset()
     frames = [env.render(row) for row in range(2)]
     assert frames[0].shape == (512, 512, 3)

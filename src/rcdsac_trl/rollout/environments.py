@@ -38,17 +38,12 @@ def environment(
         first_episode: number of each agent's first episode.
     """
     base = make_env(
-        world.map_settings,
-        world.task,
-        sensor=world.sensor,
+        world,
         split=split,
         seed=seed,
         agent_ids=agent_ids,
-        num_workers=world.num_workers,
         first_episode=first_episode,
         weighted_collisions=_is_weighted(algo),
-        worker_timeout_s=world.worker_timeout_s,
-        gui=world.gui,
     )
     env = TransformedEnv(base)
     env.append_transform(InitTracker())
@@ -72,14 +67,11 @@ def rollout_worker(
 ) -> RolloutWorker:
     """Make agents of this process that drive whole episodes; arguments as for :func:`environment`."""
     env = NavigationEnv(
-        world.map_settings,
-        world.task,
-        sensor=world.sensor,
+        world,
         split=split,
         seed=seed,
         agent_ids=agent_ids,
         weighted_collisions=_is_weighted(algo),
-        gui=world.gui,
     )
     told = _told(algo, seed, agent_ids, conditions, 0)
     return RolloutWorker(env, told, memory=memory, steps=world.task.episode_steps)

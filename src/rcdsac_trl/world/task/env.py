@@ -3,7 +3,8 @@
 import multiprocessing
 import signal
 from collections.abc import Sequence
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,12 +14,12 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.processes import START_METHOD, resolve_num_workers
-from rcdsac_trl.world.maps.generator import MapSettings, Split
+from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task.agent_group import AgentGroup
-from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, Space
+from rcdsac_trl.world.task.world_settings import WorldSettings
 
 COLLISION_WEIGHT = "collision_weight"
 # How long workers may take to close.
@@ -43,50 +44,47 @@ class NavigationEnv(OfOneProcess, EnvBase):
     It can be neither copied nor pickled: its simulations live in PyBullet. They are freed by :meth:`close`, or with it.
 
     Args:
-        map_settings: how maps are generated.
-        task: rules of the task.
-        sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
+        world: what it is made of; None: the defaults.
         split: which of the disjoint map sets.
         seed: root seed of maps, starts, goals, movers and noise.
         agent_ids: global numbers of the n agents held here, batch size [n]; agents with equal numbers meet the
-            same starts, goals and movers.
+            same starts, goals and movers. None: those from 0 to ``world.num_agents`` - 1.
         first_episode: number of the first episode, also after :meth:`set_seed`.
         weighted_collisions: read ``collision_weight`` [1] from the input and scale the collision reward by
             it; ``reward_components`` stay unscaled. It is an observation too: 1, or what a reset brings.
-        gui: show PyBullet's window for the first agent.
+        changes: fields of :class:`WorldSettings` that differ from `world`.
 
     Raises:
         UserInputError: for wrong settings, a step before the first reset, and actions outside [-1, 1].
 
     Example:
-        >>> env = NavigationEnv(agent_ids=(0, 1))
+        >>> env = NavigationEnv(agent_ids=(0, 1), sensor="sparse")
         >>> env.rollout(3)["next", "reward"].shape
         torch.Size([2, 3, 1])
     """
 
     def __init__(
         self,
-        map_settings: MapSettings | None = None,
-        task: TaskSettings | None = None,
+        world: WorldSettings | None = None,
         *,
-        sensor: str = "narrow",
         split: Split = "train",
         seed: int = 0,
-        agent_ids: Sequence[int] = tuple(range(10)),
+        agent_ids: Sequence[int] | None = None,
         first_episode: int = 0,
         weighted_collisions: bool = False,
-        gui: bool = False,
+        **changes: Any,
     ) -> None:
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([len(agent_ids)]))
+        world, ids = _with_agents(world, agent_ids, {**changes, "num_workers": 0})
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([len(ids)]))
         self.agents = AgentGroup(
-            map_settings,
-            task,
-            sensor=sensor,
+            world.map_settings,
+            world.task,
+            sensor=world.sensor,
             split=split,
             seed=seed,
-            agent_ids=agent_ids,
+            agent_ids=ids,
             first_episode=first_episode,
-            gui=gui,
+            gui=world.gui,
         )
         self._weighted = weighted_collisions
         # The arrays that the agents write into, as tensors; what is never true is among them.
@@ -200,37 +198,28 @@ def _torch_spec(space: Space, batch: torch.Size) -> TensorSpec:
 
 
 def make_env(
-    map_settings: MapSettings | None = None,
-    task: TaskSettings | None = None,
+    world: WorldSettings | None = None,
     *,
-    sensor: str = "narrow",
     split: Split = "train",
     seed: int = 0,
-    agent_ids: Sequence[int] = tuple(range(10)),
-    num_workers: int | Literal["auto"] = "auto",
+    agent_ids: Sequence[int] | None = None,
     first_episode: int = 0,
     weighted_collisions: bool = False,
-    worker_timeout_s: float | None = None,
     serial: bool = False,
-    gui: bool = False,
+    **changes: Any,
 ) -> EnvBase:
     """Make the environment of some agents, spread over worker processes.
 
     Args:
-        map_settings: as for :class:`NavigationEnv`, like all that is not listed here.
-        task: rules of the task.
-        sensor: sensor setting.
-        split: map set.
+        world: what it is made of; its `num_workers` 0 makes one :class:`NavigationEnv` of batch [n] in this process,
+            W >= 1 a ``ParallelEnv`` of W processes with n / W agents each, batch [W, n / W]. None: the defaults.
+        split: as for :class:`NavigationEnv`, like all that is not listed here.
         seed: root seed.
         agent_ids: global numbers of the n agents, in the order of the flattened batch.
-        num_workers: 0 makes one environment of batch [n] in this process; W >= 1 a ``ParallelEnv`` of W
-            processes with n / W agents each, batch [W, n / W]; ``"auto"`` takes for W the largest divisor of n
-            that is not above the number of cores this process may use.
         first_episode: number of the first episode.
         weighted_collisions: whether the environment reads ``collision_weight``.
-        worker_timeout_s: seconds without an answer after which a worker process counts as hung; None: it never does.
         serial: put the W environments into a ``SerialEnv`` in this process instead (for tests and debugging).
-        gui: show PyBullet's window for the first agent.
+        changes: fields of :class:`WorldSettings` that differ from `world`.
 
     Raises:
         UserInputError: the workers cannot share the agents evenly, or as :class:`NavigationEnv`.
@@ -239,26 +228,28 @@ def make_env(
     ``RuntimeError`` and can then only be closed; and when it is closed, it lets torch use up to a thread a worker more.
 
     Example:
-        >>> make_env(num_workers=0).batch_size
+        >>> make_env(sensor="sparse", num_workers=0).batch_size
         torch.Size([10])
     """
-    ids = tuple(agent_ids)
-    if not ids:
-        raise UserInputError("there are no agent_ids: give at least one.")
-    workers = resolve_num_workers(num_workers, len(ids))
+    world, ids = _with_agents(world, agent_ids, changes)
+    workers = resolve_num_workers(world.num_workers, len(ids))
     shared: dict[str, Any] = {
-        "map_settings": map_settings,
-        "task": task,
-        "sensor": sensor,
         "split": split,
         "seed": seed,
         "first_episode": first_episode,
         "weighted_collisions": weighted_collisions,
     }
     if workers == 0:
-        return NavigationEnv(**shared, agent_ids=ids, gui=gui)
+        return NavigationEnv(world, agent_ids=ids, **shared)
     share = len(ids) // workers
-    kwargs = [{**shared, "agent_ids": ids[w * share : (w + 1) * share], "gui": gui and w == 0} for w in range(workers)]
+    kwargs = [
+        {
+            "world": replace(world, num_agents=share, num_workers=0, gui=world.gui and worker == 0),
+            "agent_ids": ids[worker * share : (worker + 1) * share],
+            **shared,
+        }
+        for worker in range(workers)
+    ]
     if serial:
         return SerialEnv(workers, NavigationEnv, create_env_kwargs=kwargs)
     multiprocessing.set_forkserver_preload([__name__])
@@ -273,9 +264,21 @@ def make_env(
         shutdown_timeout=_SHUTDOWN_S,
     )
     env.start()
-    if worker_timeout_s is not None:
-        env.BATCHED_PIPE_TIMEOUT = worker_timeout_s
+    if world.worker_timeout_s is not None:
+        env.BATCHED_PIPE_TIMEOUT = world.worker_timeout_s
     return env
+
+
+def _with_agents(
+    world: WorldSettings | None, agent_ids: Sequence[int] | None, changes: dict[str, Any]
+) -> tuple[WorldSettings, tuple[int, ...]]:
+    """Return settings with changes, and the numbers of their agents."""
+    if agent_ids is None:
+        world = replace(world or WorldSettings(), **changes)
+        return world, tuple(range(world.num_agents))
+    if not len(agent_ids):
+        raise UserInputError("there are no agent_ids: give at least one.")
+    return replace(world or WorldSettings(), **{**changes, "num_agents": len(agent_ids)}), tuple(agent_ids)
 
 
 def _env_of_a_worker(**named: Any) -> NavigationEnv:

@@ -1,18 +1,19 @@
 """The navigation task for Gymnasium, registered as ``RCDSACNavigation-v0`` when this module is imported."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.world.maps.generator import MapSettings, Split
+from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task import gymnasium_id
 from rcdsac_trl.world.task.agent_group import AgentGroup
-from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, AGENT_OBSERVATIONS, SPACES
+from rcdsac_trl.world.task.world_settings import WorldSettings
 
 FRAMES_PER_S = 7  # a control period is 0.14 s on average
 
@@ -33,15 +34,13 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
     It can be neither copied nor pickled: its simulation lives in PyBullet. It is freed by :meth:`close`, or with it.
 
     Args:
-        map_settings: how maps are generated.
-        task: rules of the task.
-        sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
+        world: what it is made of; None: the defaults. Of its agents there is one.
         split: which of the disjoint map sets.
         seed: root seed until a reset brings another; None: the first reset draws one.
         agent_id: the agent's global number.
         first_episode: number of the first episode.
-        gui: show PyBullet's window.
         render_mode: ``"rgb_array"`` or None.
+        changes: fields of :class:`~rcdsac_trl.world.task.world_settings.WorldSettings` that differ from `world`.
 
     Example:
         >>> env = gymnasium.make("rcdsac_trl:RCDSACNavigation-v0", sensor="full")
@@ -54,16 +53,14 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
 
     def __init__(
         self,
-        map_settings: MapSettings | None = None,
-        task: TaskSettings | None = None,
+        world: WorldSettings | None = None,
         *,
-        sensor: str = "narrow",
         split: Split = "train",
         seed: int | None = None,
         agent_id: int = 0,
         first_episode: int = 0,
-        gui: bool = False,
         render_mode: str | None = None,
+        **changes: Any,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserInputError(f"render_mode={render_mode!r} does not exist; use 'rgb_array' or None")
@@ -72,15 +69,16 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         )
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         self.render_mode = render_mode
+        world = replace(world or WorldSettings(), **changes)
         self._agents = AgentGroup(
-            map_settings,
-            task,
-            sensor=sensor,
+            world.map_settings,
+            world.task,
+            sensor=world.sensor,
             split=split,
             seed=0 if seed is None else seed,
             agent_ids=(agent_id,),
             first_episode=first_episode,
-            gui=gui,
+            gui=world.gui,
         )
         self._seed = seed
         self._has_begun = False

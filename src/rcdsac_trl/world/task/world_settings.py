@@ -1,6 +1,6 @@
 """What an environment is made of."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from rcdsac_trl.errors import UserInputError
@@ -13,13 +13,32 @@ from rcdsac_trl.world.task.rules import TaskSettings
 
 @dataclass(frozen=True)
 class WorldSettings:
-    """What an environment is made of."""
+    """What an environment is made of.
 
-    map_settings: MapSettings
-    task: TaskSettings
-    sensor: str
-    num_agents: int
-    num_workers: int | Literal["auto"]
+    Attributes:
+        map_settings: how maps are generated.
+        task: rules of the task.
+        sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
+        num_agents: agents side by side on each map.
+        num_workers: processes of :func:`~rcdsac_trl.world.task.env.make_env`: 0 for none, W >= 1 for a ``ParallelEnv``
+            of W with ``num_agents / W`` agents each; ``"auto"`` takes for W the largest divisor of ``num_agents`` that
+            is not above the number of cores this process may use.
+        worker_timeout_s: seconds without an answer after which a worker process counts as hung; None: it never does.
+        gui: show PyBullet's window for the first agent.
+
+    Raises:
+        UserInputError: for an unknown sensor, and agents that the workers cannot share evenly.
+
+    Example:
+        >>> WorldSettings(sensor="sparse").num_agents
+        10
+    """
+
+    map_settings: MapSettings = field(default_factory=MapSettings)
+    task: TaskSettings = field(default_factory=TaskSettings)
+    sensor: str = "narrow"
+    num_agents: int = 10
+    num_workers: int | Literal["auto"] = "auto"
     worker_timeout_s: float | None = None
     gui: bool = False
 
