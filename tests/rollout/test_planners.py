@@ -524,7 +524,7 @@ def test_settings_refuse(settings: Callable[[], object], sentence: str) -> None:
 # ------------------------------------------------------------------------------------------------ documents
 @pytest.mark.parametrize("settings", [MppiSettings, DwaSettings, CostSettings, LocalMapSettings, TrackSettings])
 def test_the_page_tells_every_parameter(settings: Callable[[], Any]) -> None:
-    page = (Path(__file__).parents[1] / "docs" / "planners.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "planners.md").read_text()
     table = page.split(f"**`{settings.__name__}`**")[1].split("\n**")[0].split("\n## ")[0]
     told = {name: float(value) for name, value in re.findall(r"^\| `(\w+)` \| (\S+) \|", table, re.M)}
     assert told == {name: value for name, value in asdict(settings()).items() if name != "common"}
