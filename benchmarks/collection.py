@@ -91,9 +91,7 @@ def collectors(overrides: list[str], batches: int) -> dict[str, float]:
         "in_process_steps_per_second": collected([*overrides, *in_process], batches, wall=False),
         "processes_steps_per_second": collected(overrides, batches, wall=True),
         "torchrl_steps_per_second": collected([*overrides, *by_torchrl], batches, wall=False),
-        "parallel_env_steps_per_second": collected(
-            [*overrides, *by_torchrl, "world.num_workers=auto"], batches, wall=True
-        ),
+        "parallel_env_steps_per_second": collected([*overrides, "collector=parallel_env"], batches, wall=True),
     }
 
 

@@ -49,7 +49,7 @@ def test_collection(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     found = printed(capsys)
     keys = ("env_steps_per_second", "bullet_fraction", "collector_steps_per_second", "naive_steps_per_second")
     assert all(found[key] > 0 for key in keys)
-    bodies, simulation = (sys.modules[f"rcdsac_trl.world.{name}"] for name in ("bodies", "simulation"))
+    bodies, simulation = (sys.modules[f"rcdsac_trl.world.sim.{name}"] for name in ("bodies", "simulation"))
     with monkeypatch.context() as own:  # what it changes in the world is put back
         own.setattr(bodies, "SHAPES_PER_BODY", bodies.SHAPES_PER_BODY)  # type: ignore[attr-defined]
         own.setattr(simulation.Simulation, "scan", simulation.Simulation.scan)  # type: ignore[attr-defined]
