@@ -385,7 +385,7 @@ def settled(beta: float) -> tuple[float, float]:
     policy = Policy(decided())
     message = laser(0.0)
     scan = Scan(np.array(message.ranges), message.angle_min, message.angle_increment, 0.1, 10.0)
-    commands = [policy.act(scan, [5.0, 2.0], (0.3, -0.2), beta) for _ in range(40)]
+    commands = [policy.act(scan, [5.0, 2.0], (0.3, -0.2), beta) for _ in range(400)]
     assert {command.reason for command in commands} == {None}
     assert commands[-1].wanted == pytest.approx(commands[-2].wanted, abs=1e-6)
     return commands[-1].v_m_per_s, commands[-1].omega_rad_per_s
