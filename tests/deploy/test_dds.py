@@ -269,8 +269,8 @@ def test_it_says_who_reads_its_commands_and_who_writes_what_it_needs() -> None:
 
 # ------------------------------------------------------------------------------------------------ the program
 def decided() -> Weights:
-    """Make an agent that knows what it wants: beta turns it from right to left, and it takes few steps to settle."""
-    weights = agent(9)
+    """Make an agent that knows what it wants: beta changes its command, and it takes few steps to settle."""
+    weights = agent(28)
     return Weights(weights.config, {name: 3.0 * tensor for name, tensor in weights.tensors.items()})
 
 
@@ -385,7 +385,7 @@ def settled(beta: float) -> tuple[float, float]:
     policy = Policy(decided())
     message = laser(0.0)
     scan = Scan(np.array(message.ranges), message.angle_min, message.angle_increment, 0.1, 10.0)
-    commands = [policy.act(scan, [5.0, 2.0], (0.3, -0.2), beta) for _ in range(400)]
+    commands = [policy.act(scan, [5.0, 2.0], (0.3, -0.2), beta) for _ in range(40)]
     assert {command.reason for command in commands} == {None}
     assert commands[-1].wanted == pytest.approx(commands[-2].wanted, abs=1e-6)
     return commands[-1].v_m_per_s, commands[-1].omega_rad_per_s
