@@ -65,7 +65,8 @@ class ControllerPolicy(TensorDictModuleBase):
         >>> policy = ControllerPolicy(Dwa, "dwa", sensor_mask("narrow"), agent_ids=[0], seed=0)
         >>> ahead = torch.tensor([[1.0, 1.0, 0.0, 1.0, 1.0, 0.0]])
         >>> seen = {"range": torch.zeros(1, 180), "waypoint": ahead, "velocity": torch.zeros(1, 4)}
-        >>> policy(TensorDict({**seen, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1]))["action"][:, 0]
+        >>> begin = torch.ones(1, 1, dtype=torch.bool)
+        >>> policy(TensorDict({**seen, "is_init": begin}, [1]))["action"][:, 0]  # full speed
         tensor([1.])
     """
 
