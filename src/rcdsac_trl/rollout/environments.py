@@ -49,9 +49,9 @@ def environment(
     env.append_transform(InitTracker())
     env.append_transform(StepCounter(max_steps=world.task.episode_steps))
     env.append_transform(recurrent_state_primer(memory))
-    told = _told(algo, seed, agent_ids, conditions, first_episode)
-    if told is not None:
-        env.append_transform(told)
+    sampler = _sampler(algo, seed, agent_ids, conditions, first_episode)
+    if sampler is not None:
+        env.append_transform(sampler)
     return env
 
 
@@ -73,15 +73,15 @@ def rollout_worker(
         agent_ids=agent_ids,
         weighted_collisions=_is_weighted(algo),
     )
-    told = _told(algo, seed, agent_ids, conditions, 0)
-    return RolloutWorker(env, told, memory=memory, steps=world.task.episode_steps)
+    sampler = _sampler(algo, seed, agent_ids, conditions, 0)
+    return RolloutWorker(env, sampler, memory=memory, steps=world.task.episode_steps)
 
 
 def _is_weighted(algo: AlgoSettings | None) -> bool:
     return algo is not None and algo.collision_weight is not None
 
 
-def _told(
+def _sampler(
     algo: AlgoSettings | None,
     seed: int,
     agent_ids: Sequence[int],

@@ -32,7 +32,7 @@ class EpisodeCollector(Protocol):
 
 
 class WorkerEpisodeCollector:
-    """Has whole episodes driven by group, each with a copy of the actor that comes with every request.
+    """Has whole episodes driven by a group of workers, each with a copy of the actor that comes with every request.
 
     Args:
         make: makes the group.

@@ -93,7 +93,7 @@ def evaluate_maps(
     Args:
         make: makes what drives; called once in every process that drives, so with processes it must pickle.
         num_maps: how many maps.
-        processes: from :func:`resolve_processes`; 0: this one drives.
+        processes: from :func:`rcdsac_trl.system.processes.resolve_processes`; 0: this one drives.
 
     Raises:
         FaultError: if a process ends before its work does; it has written why to stderr.
@@ -102,8 +102,8 @@ def evaluate_maps(
         with make() as drive:
             yield from (drive(map_index, interruption_point) for map_index in range(num_maps))
         return
-    with contextlib.closing(EvaluationPool(make, num_maps, processes)) as drivers:
+    with contextlib.closing(EvaluationPool(make, num_maps, processes)) as pool:
         try:
-            yield from drivers.receive(until_done=True)
+            yield from pool.receive(until_done=True)
         except WorkerError as error:
             raise FaultError(f"{error}: nothing is written, start again") from error

@@ -16,6 +16,7 @@ from rcdsac_trl.rollout.env_workers import EnvWorkers
 from rcdsac_trl.rollout.environments import environment, rollout_worker
 from rcdsac_trl.rollout.episode_collectors import EpisodeCollector, TorchRLEpisodeCollector, WorkerEpisodeCollector
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, packed
+from rcdsac_trl.rollout.metrics import HAPPENED
 from rcdsac_trl.rollout.policies import AgentNoise, CollectionPolicy
 from rcdsac_trl.rollout.worker import EpisodeBatch
 from rcdsac_trl.rollout.worker_processes import (
@@ -34,8 +35,6 @@ from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.task.spaces import AGENT_OBSERVATIONS
 
 SPLIT: Split = "train"
-# What the replay and the metrics read of a step, beside the observations.
-_HAPPENED = ("contact", "goal_reached", "reward_components")
 
 
 def make_episodes(
@@ -125,7 +124,7 @@ def _worker(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Dr
                 policy,
                 request.map_index,
                 observed=AGENT_OBSERVATIONS,
-                happened=_HAPPENED,
+                happened=HAPPENED,
                 before_step=before_step,
             )
 

@@ -12,16 +12,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.rollout.evaluation_pool import Rows
-from rcdsac_trl.rollout.metrics import episode_metrics
+from rcdsac_trl.rollout.metrics import HAPPENED, episode_metrics
 from rcdsac_trl.rollout.worker import RolloutWorker
 from rcdsac_trl.system.interrupts import interruption_point
 
 # What an episode's row needs; everything else of a step is dropped at once.
 _OBSERVED = ("velocity", "pose")
-
-
-_HAPPENED = ("contact", "goal_reached", "reward_components")
-
 
 # Columns that say what drove an episode, as far as there are such.
 CONDITION_COLUMNS = ("beta", "collision_weight", "beta_controller")
@@ -59,7 +55,7 @@ def measure_map(
     """
     kind = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
-        driven = worker.rollout(policy, map_index, observed=_OBSERVED, happened=_HAPPENED, before_step=before_step)
+        driven = worker.rollout(policy, map_index, observed=_OBSERVED, happened=HAPPENED, before_step=before_step)
     episodes = driven.tensordict()
     measured = episode_metrics(episodes) | ({} if more is None else more(episodes))
     rows = []

@@ -8,6 +8,8 @@ from torch import Tensor
 from rcdsac_trl.world.task.rules import COLLISION_REWARD, combined
 
 METRICS = ("collisions", "reward", "goals", "mean_speed_m_per_s", "contact_fraction")
+# What they and the replay read of what a step led to, beside the observations.
+HAPPENED = ("contact", "goal_reached", "reward_components")
 
 
 def contact_onsets(contact: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ MakeDrive = Callable[[], AbstractContextManager[Drive]]
 
 
 class WorkerGroup(Protocol):
-    """WorkerGroup that together hold all agents."""
+    """Workers that together hold all agents."""
 
     def ask(self, request: RolloutRequest) -> TensorDictBase:
         """Return the episodes of all agents, ``[N, T]``, worker after worker."""
@@ -68,7 +68,7 @@ class WorkerProcesses:
 
     Args:
         makes: what makes each worker's drive, in its process; must pickle.
-        described: the worker of each, for messages.
+        described: what describes each worker, for messages.
         timeout_s: seconds in which a process must take a step, else it counts as hung; None: it never does.
     """
 

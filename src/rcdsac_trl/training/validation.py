@@ -73,7 +73,7 @@ class SnapshotEvaluator:
         self._processes_alone = processes_alone
         self._timeout_s = timeout_s
         self._alone = False
-        self._drivers: EvaluationPool | None = None
+        self._pool: EvaluationPool | None = None
         self._maps: list[Rows] = []
         if self.beside:
             prepare()
@@ -102,8 +102,8 @@ class SnapshotEvaluator:
         self._maps = []
         processes = self._processes_alone if self._alone else self._processes
         make = partial(self._make, snapshot.actor)
-        self._drivers = EvaluationPool(make, self._num_maps, processes, timeout_s=self._timeout_s, at_once=True)
-        return self._drivers
+        self._pool = EvaluationPool(make, self._num_maps, processes, timeout_s=self._timeout_s, at_once=True)
+        return self._pool
 
     def poll(self) -> None:
         """Take what is measured so far, without waiting.
@@ -131,17 +131,17 @@ class SnapshotEvaluator:
 
     def _receive(self, snapshot: Snapshot, *, until_done: bool) -> None:
         try:
-            drivers = self._drivers or self._begin(snapshot)
-            self._maps.extend(drivers.receive(until_done=until_done))
+            pool = self._pool or self._begin(snapshot)
+            self._maps.extend(pool.receive(until_done=until_done))
         except WorkerError:
             self.close()
             raise
 
     def close(self) -> None:
         """End the processes."""
-        if self._drivers is not None:
-            self._drivers.close()
-        self._drivers = None
+        if self._pool is not None:
+            self._pool.close()
+        self._pool = None
 
 
 class Validation:
