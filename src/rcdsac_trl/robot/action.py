@@ -42,6 +42,23 @@ def desired_velocities(action: Sequence[float] | NDArray) -> tuple[float, float]
     return linear, 0.0 if inside_dead_band(angular) else angular
 
 
+def action_of(linear: float, angular: float) -> tuple[float, float]:
+    """Return the action u of desired velocities. Undoes :func:`desired_velocities`.
+
+    Args:
+        linear: m/s; what is beyond the robot's range is clipped.
+        angular: rad/s; likewise.
+
+    Example:
+        >>> action_of(0.6, 0.0)
+        (1.0, 0.0)
+    """
+    v = min(max(linear, MIN_LINEAR_VELOCITY), MAX_LINEAR_VELOCITY)
+    omega = min(max(angular, -MAX_ANGULAR_VELOCITY), MAX_ANGULAR_VELOCITY)
+    share = (v - MIN_LINEAR_VELOCITY) / (MAX_LINEAR_VELOCITY - MIN_LINEAR_VELOCITY)
+    return 2.0 * share - 1.0, omega / MAX_ANGULAR_VELOCITY
+
+
 def inside_dead_band(angular_velocity: float) -> bool:
     """Return whether |omega| < 15 deg/s; exactly 15 deg/s is outside, float rounding or not."""
     return abs(angular_velocity) < DEAD_BAND * (1.0 - _ANGULAR_TOLERANCE)

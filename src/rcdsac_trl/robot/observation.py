@@ -99,6 +99,20 @@ def waypoint_observation(pose: tuple[float, float, float], waypoint_1: Point, wa
     )
 
 
+def waypoint_positions(observed: ArrayLike) -> NDArray[np.float64]:
+    """Return where waypoints are, float64 [N, 2, 2], in the robot's frame, m. Undoes :func:`waypoint_observation`.
+
+    Args:
+        observed: o_waypoint, [N, 6].
+
+    Example:
+        >>> waypoint_positions([[1.0, 1.0, 0.0, 2.0, 0.0, 1.0]]).tolist()
+        [[[10.0, 0.0], [0.0, 100.0]]]
+    """
+    each = np.asarray(observed, np.float64).reshape(-1, 2, 3)
+    return 10.0 ** each[..., :1] * each[..., 1:]
+
+
 def distance_and_bearing(pose: tuple[float, float, float], point: Point) -> tuple[float, float]:
     """Return the distance to a point in m and its angle from the robot's x axis in rad, any full turns apart.
 

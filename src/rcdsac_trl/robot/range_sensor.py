@@ -1,5 +1,6 @@
 """The range sensor: its bins, its reach, and which bins a sensor of a name has (paper, "States and Observations")."""
 
+import math
 from typing import Literal, get_args
 
 import numpy as np
@@ -10,6 +11,10 @@ from rcdsac_trl.errors import UserInputError
 # The range sensor (paper, section "States and Observations").
 NUM_BINS = 180
 """Number of sectors; bin i (counted from 1) covers [2i-2, 2i) degrees counter-clockwise from the x axis."""
+
+
+BIN_RAD = 2.0 * math.pi / NUM_BINS
+"""Width of a sector."""
 
 
 MAX_RANGE_M = 3.0

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.sensors.sectors import BIN_RAD, Sectors
+from rcdsac_trl.deploy.sensors.sectors import Sectors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.limits import (
     MAX_ANGULAR_ACCELERATION,
@@ -20,7 +20,7 @@ from rcdsac_trl.robot.limits import (
     MAX_LINEAR_VELOCITY,
     MIN_LINEAR_VELOCITY,
 )
-from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 
 # Shares of the wanted speed that are tried, the fastest first.
 _SHARES = (1.0, 0.75, 0.5, 0.25)

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
-from rcdsac_trl.deploy.sensors.sectors import BIN_RAD, BODY_RADIUS_M, Sectors, bins_of, nearest_by_sector
+from rcdsac_trl.deploy.sensors.sectors import BODY_RADIUS_M, Sectors, bins_of, nearest_by_sector
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 
 # Farther from the robot's centre, no camera is mounted: mm, then.
 _FARTHEST_CAMERA_M = 3.0

@@ -7,10 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 
-BIN_RAD = 2.0 * math.pi / NUM_BINS
-"""Width of a sector."""
 BODY_RADIUS_M = 0.2
 """What is nearer to the robot's centre is the robot itself: nothing else gets inside an octagon of 0.25 m, whose sides
 are 0.23 m away."""

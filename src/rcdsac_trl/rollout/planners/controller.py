@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
-from rcdsac_trl.robot.observation import range_distances
+from rcdsac_trl.robot.action import action_of
+from rcdsac_trl.robot.observation import range_distances, waypoint_positions
 from rcdsac_trl.seeding import stream
 
 
@@ -116,7 +116,7 @@ class ControllerPolicy(TensorDictModuleBase):
         return tensordict.set("action", torch.from_numpy(actions).view(*tensordict.batch_size, -1))
 
     def _action(self, answer: object) -> tuple[float, float]:
-        """Return the action of desired velocities; undoes :func:`rcdsac_trl.robot.action.desired_velocities`."""
+        """Return the action of what a controller answered."""
         try:
             v, omega = (float(value) for value in answer)  # type: ignore[attr-defined]
         except (TypeError, ValueError):
@@ -126,21 +126,4 @@ class ControllerPolicy(TensorDictModuleBase):
                 f"baseline={self._name} answered {answer!r}: act() must return the desired velocities, two finite "
                 "numbers in m/s and rad/s"
             )
-        v = min(max(v, MIN_LINEAR_VELOCITY), MAX_LINEAR_VELOCITY)
-        omega = min(max(omega, -MAX_ANGULAR_VELOCITY), MAX_ANGULAR_VELOCITY)
-        share = (v - MIN_LINEAR_VELOCITY) / (MAX_LINEAR_VELOCITY - MIN_LINEAR_VELOCITY)
-        return 2.0 * share - 1.0, omega / MAX_ANGULAR_VELOCITY
-
-
-def waypoint_positions(observed: NDArray) -> NDArray[np.float64]:
-    """Return where waypoints are, float64 [N, 2, 2], in the robot's frame, m.
-
-    Args:
-        observed: o_waypoint, [N, 6]; see :func:`rcdsac_trl.robot.observation.waypoint_observation`.
-
-    Example:
-        >>> waypoint_positions(np.array([[1.0, 1.0, 0.0, 2.0, 0.0, 1.0]])).tolist()
-        [[[10.0, 0.0], [0.0, 100.0]]]
-    """
-    each = np.asarray(observed, np.float64).reshape(-1, 2, 3)
-    return 10.0 ** each[..., :1] * each[..., 1:]
+        return action_of(v, omega)

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 from rcdsac_trl.system.jit import njit
 
-_BIN_RAD = 2.0 * math.pi / NUM_BINS
 _NEVER = -math.inf
 _NOTHING = np.empty((0, 6))
 
@@ -185,7 +184,7 @@ def _clear(points: np.ndarray, pose: np.ndarray, ranges_m: np.ndarray, sensed: n
                 continue
             dx, dy = points[i, j, 0] - pose[0], points[i, j, 1] - pose[1]
             bearing = math.atan2(dy, dx) - pose[2]
-            bin_ = math.floor(bearing / _BIN_RAD) % NUM_BINS
+            bin_ = math.floor(bearing / BIN_RAD) % NUM_BINS
             if sensed[bin_] and math.hypot(dx, dy) < min(ranges_m[bin_], MAX_RANGE_M) - margin_m:
                 points[i, j, 2] = _NEVER
 
@@ -207,7 +206,7 @@ def _add(
     for bin_ in range(NUM_BINS):
         if not sensed[bin_] or ranges_m[bin_] >= MAX_RANGE_M:
             continue
-        bearing = pose[2] + (bin_ + 0.5) * _BIN_RAD
+        bearing = pose[2] + (bin_ + 0.5) * BIN_RAD
         dx, dy = ranges_m[bin_] * math.cos(bearing), ranges_m[bin_] * math.sin(bearing)
         if max(abs(dx), abs(dy)) >= half_m:
             continue

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 from rcdsac_trl.system.jit import njit
 
-_BIN_RAD = 2.0 * math.pi / NUM_BINS
 _MOST_TRACKS = 12
 # Columns of the tracks: place, velocity, time since it was seen, how often it was, and whether there is one.
 _X, _Y, _VX, _VY, _UNSEEN_S, _TIMES, _USED = range(7)
@@ -146,10 +145,10 @@ def _find(
             last, near_m, count = following, min(near_m, ranges_m[following]), count + 1
             done += 1
         before, after = (first - 1) % NUM_BINS, (last + 1) % NUM_BINS
-        if not sensed[before] or not sensed[after] or near_m * count * _BIN_RAD > widest_m:
+        if not sensed[before] or not sensed[after] or near_m * count * BIN_RAD > widest_m:
             continue
         if ranges_m[before] > ranges_m[first] and ranges_m[after] > ranges_m[last]:
-            bearing = pose[2] + (first + 0.5 * count) * _BIN_RAD
+            bearing = pose[2] + (first + 0.5 * count) * BIN_RAD
             things[number, 0] = pose[0] + (near_m + radius_m) * math.cos(bearing)
             things[number, 1] = pose[1] + (near_m + radius_m) * math.sin(bearing)
             number += 1

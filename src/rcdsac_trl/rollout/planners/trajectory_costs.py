@@ -18,7 +18,7 @@ from rcdsac_trl.rollout.planners.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.rollout.planners.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.system.jit import njit
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
-from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE
+from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE, TaskSettings
 
 PERIOD_S = 0.14
 """The mean control period; the real one, 0.12 to 0.16 s, an agent is not told."""
@@ -65,8 +65,8 @@ class CostSettings:
     ahead_m: float = 0.3
     reverse: float = 1.0
     goal_m: float = 1.0
-    waypoint_radius_m: float = 0.5
-    goal_radius_m: float = 0.15
+    waypoint_radius_m: float = TaskSettings.waypoint_radius_m
+    goal_radius_m: float = TaskSettings.goal_radius_m
 
     def __post_init__(self) -> None:
         """Refuse rewards for what should cost."""

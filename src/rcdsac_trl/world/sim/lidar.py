@@ -10,13 +10,12 @@ import math
 
 import numpy as np
 
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 from rcdsac_trl.system.jit import njit
 
-_BIN_RAD = 2.0 * math.pi / NUM_BINS
 # Directions of the borders between the bins; border b is where bin b (from 0) begins.
-_BORDER_COS = np.cos(np.arange(NUM_BINS) * _BIN_RAD)
-_BORDER_SIN = np.sin(np.arange(NUM_BINS) * _BIN_RAD)
+_BORDER_COS = np.cos(np.arange(NUM_BINS) * BIN_RAD)
+_BORDER_SIN = np.sin(np.arange(NUM_BINS) * BIN_RAD)
 
 
 @njit
@@ -25,7 +24,7 @@ def _bin_of(angle: float) -> int:
     if angle < 0.0:
         angle += 2.0 * math.pi
     # Rounding can carry an angle just below the full turn onto it.
-    return int(angle / _BIN_RAD) % NUM_BINS
+    return int(angle / BIN_RAD) % NUM_BINS
 
 
 @njit
