@@ -372,6 +372,38 @@ def test_no_bootstrap_beyond_termination() -> None:
     torch.testing.assert_close(target, batch["next", "reward"][:, :-1].expand(3, 4, 5))
 
 
+def test_n_step_targets_by_hand() -> None:
+    """Rewards and entropies of the steps on the way, gamma^m for what comes then, and fewer steps at the end."""
+    gamma, steps, n = 0.9, 4, 3
+    batch = make_batch(steps=steps)
+    batch["next", "terminated"][:] = False
+    batch["next", "terminated"][0, 1] = True
+
+    def target(**settings: Any) -> Tensor:
+        loss.settings, loss.log_alpha.data = LossSettings(**settings), torch.tensor(math.log(alpha))
+        loss.rng_state = torch.Generator().manual_seed(5).get_state()
+        return loss.compute_target(batch, loss.encode_actor(batch), loss.draw_samples(batch))
+
+    loss, never = make_loss(num_target_quantiles=2), batch["next", "terminated"].clone()
+    alpha, reward = 1e-30, batch["next", "reward"][:, :-1]
+    batch["next", "terminated"][:] = False
+    value = (target(num_target_quantiles=2) - reward) / gamma  # of what each step leads to
+    alpha = 0.2
+    entropy = (target(num_target_quantiles=2) - reward) / gamma - value
+    batch["next", "terminated"] = never
+    found = target(num_target_quantiles=2, n_steps=n)
+
+    for b in range(3):
+        for t in range(steps):
+            expected, discount = torch.zeros(2), 1.0
+            for k in range(t, min(t + n, steps)):
+                expected += discount * reward[b, k]
+                discount *= gamma * (not never[b, k].item())
+                expected += discount * entropy[b, k]
+            expected += discount * value[b, k]
+            torch.testing.assert_close(found[b, t], expected)
+
+
 def test_a_constant_beta_collapses_to_the_same_losses() -> None:
     batch = make_batch(beta=-0.7)
     loss = make_loss(reduction="none")
@@ -592,6 +624,7 @@ def test_state_dict_continues_bit_for_bit() -> None:
         ({"number": 0}, "at least one critic"),
         ({"num_quantiles": 0}, "loss.num_quantiles=0 is not a number of at least 1"),
         ({"alpha_init": 0.0}, "loss.alpha_init=0.0 is not a positive number"),
+        ({"n_steps": 0}, "loss.n_steps=0 is not a number of at least 1"),
         ({"kappa": -1.0}, "loss.kappa=-1.0 is not a positive number"),
         ({"burn_in": -1}, "loss.burn_in=-1 is not a number of at least 0"),
         ({"fractions_per": "batch"}, "loss.fractions_per=batch is unknown: choose one of transition, sequence"),

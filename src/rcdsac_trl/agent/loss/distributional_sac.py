@@ -33,7 +33,8 @@ class DistributionalSACLoss(LinkedLoss):
       :math:`\tau_i, \tau'_j \sim U(0,1)` between :math:`\hat Z_{\tau_i}(s_t, a_t; \beta)` and
       :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a; \beta) - \alpha \log\pi(a|s_{t+1},\beta))`,
       with a policy action :math:`a` and the element-wise minimum (or what ``target_over_critics`` says) over the target
-      critics; summed over the critics;
+      critics; summed over the critics. With ``n_steps`` above 1 the rewards and entropies of the steps on the way come
+      first;
     - actor: :math:`\alpha \log\pi - \min_k \frac1K \sum_j \hat Z^k_{\psi(\tau_j;\beta)}(s_t, a; \beta)`;
     - temperature: :math:`-\log\alpha \, (\log\pi + \bar H)`.
 
@@ -173,11 +174,18 @@ class DistributionalSACLoss(LinkedLoss):
                 memory = self._encode(critic, tensordict)[:, 1:]
                 values.append(self._evaluate(critic, memory, action, samples.next_tau, risk))
             next_value = OVER_CRITICS[self.settings.target_over_critics](values)
-            next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
+            entropy_bonus = -self.alpha * log_prob.unsqueeze(-1)
             # What TorchRL's estimator calls, with its shapes: every target fraction gets its own entry.
             reward = self._transitions(tensordict, ("next", self.tensor_keys.reward)).expand_as(next_value)
             terminated = self._transitions(tensordict, ("next", self.tensor_keys.terminated)).expand_as(next_value)
-            return td0_return_estimate(self.value_estimator.gamma, next_value, reward, terminated)
+            gamma = self.value_estimator.gamma
+            target = td0_return_estimate(gamma, next_value + entropy_bonus, reward, terminated)
+            for _ in range(self.settings.n_steps - 1):
+                # What a step leads to is worth the target of the next step, one step shorter; at the sequence's end
+                # there is none.
+                next_value = torch.cat((target[:, 1:], next_value[:, -1:]), dim=1)
+                target = td0_return_estimate(gamma, next_value + entropy_bonus, reward, terminated)
+            return target
 
     def qvalue_loss(
         self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples

@@ -27,6 +27,8 @@ class LossSettings:
             one critic's set is the same, its variance falls with :math:`N^{-3}` where quantiles are smooth, not
             :math:`N^{-1}`. What takes the lower of two such means, the actor's loss and the target ``"smaller"``, has
             another expectation: less noise, less of a bias downwards.
+        n_steps: transitions that a target sums rewards over before it bootstraps; fewer at a sequence's end. The actions
+            on the way are the replay's, whatever the policy would do now.
         kappa: where the quantile Huber loss turns from quadratic to linear, in units of the return.
         alpha_init: temperature at the start, above 0.
         target_entropy: the entropy the temperature aims for, in nats.
@@ -53,6 +55,7 @@ class LossSettings:
     num_risk_samples: int = 16
     fractions_per: DrawnPer = "sequence"
     fraction_sampling: FractionSampling = "uniform"
+    n_steps: int = 1
     kappa: float = 1.0
     alpha_init: float = 1.0
     target_entropy: float = -2.0
@@ -61,7 +64,7 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""
-        at_least(self.section, self, 1, "num_quantiles num_target_quantiles num_risk_samples")
+        at_least(self.section, self, 1, "num_quantiles num_target_quantiles num_risk_samples n_steps")
         at_least(self.section, self, 0, "burn_in")
         positive(self.section, self, "kappa alpha_init")
         one_of(f"{self.section}.fractions_per", self.fractions_per, DrawnPer)
