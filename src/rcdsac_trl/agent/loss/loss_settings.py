@@ -27,8 +27,8 @@ class LossSettings:
             one critic's set is the same, its variance falls with :math:`N^{-3}` where quantiles are smooth, not
             :math:`N^{-1}`. What takes the lower of two such means, the actor's loss and the target ``"smaller"``, has
             another expectation: less noise, less of a bias downwards.
-        n_steps: transitions that a target sums rewards over before it bootstraps; fewer at a sequence's end. The actions
-            on the way are the replay's, whatever the policy would do now.
+        n_steps: transitions that a target sums rewards over before it bootstraps, fewer at a sequence's end. The
+            actions on the way are the replay's, whatever the policy would do now.
         kappa: where the quantile Huber loss turns from quadratic to linear, in units of the return.
         alpha_init: temperature at the start, above 0.
         target_entropy: the entropy the temperature aims for, in nats.
