@@ -183,7 +183,9 @@ def row(name: str) -> AlgoSettings:
 
 
 def test_the_table_of_keys_is_what_the_environment_has() -> None:
-    world = WorldSettings(MapSettings(size_m=10.0), TaskSettings(), sensor="narrow", num_agents=2, num_workers=0)
+    world = WorldSettings(
+        MapSettings(size_m=10.0), TaskSettings(), sensor="narrow", memory_s=9.0, num_agents=2, num_workers=0
+    )
     found: dict[str, tuple[int, torch.dtype]] = {}
     for name in ("rcdsac_pow", "rcwr"):
         env = environment(world, row(name), split="train", seed=0, agent_ids=range(2), memory=NetworkSettings().memory)

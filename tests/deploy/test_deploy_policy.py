@@ -17,6 +17,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from robots import AHEAD, OPEN, ROWS, STANDING, agent, full_size
 
 PERIOD_S = 0.14
@@ -32,9 +33,10 @@ def row(tensor_like: Any) -> torch.Tensor:
 
 # ------------------------------------------------------------------------------------------------ the numbers
 @pytest.mark.parametrize("name", ROWS)
-@pytest.mark.parametrize("sensor", ["narrow", "sparse", "full"])
-def test_it_drives_as_torch_and_the_world_say(name: str, sensor: str) -> None:
-    weights = full_size(**ROWS[name], sensor=sensor)
+@pytest.mark.parametrize(("sensor", "memory_s"), [("narrow", 0.0), ("narrow", 9.0), ("sparse", 0.0), ("full", 0.0)])
+def test_it_drives_as_torch_and_the_world_say(name: str, sensor: str, memory_s: float) -> None:
+    weights = full_size(**ROWS[name], sensor=sensor, memory_s=memory_s)
+    remembered = RememberedRanges(sensor_mask(sensor), memory_s)
     policy = Policy(weights, guard=None)
     actor, critics = ActorStep.of_weights(weights), CriticStep(weights, torch.from_numpy(policy.fractions))
     memory, memories = torch.zeros(1, 128), torch.zeros(2, 1, 128)
@@ -49,9 +51,10 @@ def test_it_drives_as_torch_and_the_world_say(name: str, sensor: str) -> None:
         bins = row(range_observation(distances, sensor_mask(sensor)))
         waypoint = row(waypoint_observation((0.0, 0.0, 0.0), *map(tuple, waypoints.tolist())))
         vector, context = row([*velocity, *commanded]), row([told])
+        seen = row(remembered.observe(distances, *velocity, PERIOD_S if step else 0.0)) if memory_s else None
         with torch.no_grad():
-            action, memory = actor(bins, waypoint, vector, context, memory)
-            values, memories = critics(bins, waypoint, vector, context, action, memories)
+            action, memory = actor(bins, waypoint, vector, context, memory, seen)
+            values, memories = critics(bins, waypoint, vector, context, action, memories, seen)
         keywords = {} if weights.config.context is None else {weights.config.context: told}
         command = policy.act(distances, waypoints, velocity, **keywords)
         commanded = desired_velocities(action[0].tolist())
@@ -72,6 +75,18 @@ def test_beta_may_change_at_every_call_and_matters() -> None:
     a.act(OPEN, AHEAD, STANDING, -2.0)
     b.act(OPEN, AHEAD, STANDING, 0.0)
     assert a.act(OPEN, AHEAD, STANDING, -1.0).value == b.act(OPEN, AHEAD, STANDING, -1.0).value
+
+
+def test_a_copy_remembers_for_itself() -> None:
+    policy = Policy(full_size(memory_s=9.0), guard=None)
+    policy.act(np.full(180, 1.0), AHEAD, STANDING)
+    kept = copy.copy(policy)
+    policy.act(np.full(180, 0.5), AHEAD, STANDING)
+    wanted = kept.act(OPEN, AHEAD, STANDING).wanted
+    assert wanted != policy.act(OPEN, AHEAD, STANDING).wanted
+    again = Policy(full_size(memory_s=9.0), guard=None)
+    again.act(np.full(180, 1.0), AHEAD, STANDING)
+    assert again.act(OPEN, AHEAD, STANDING).wanted == wanted
 
 
 def test_it_foresees_what_it_would_do_and_expect_at_another_beta() -> None:

@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
+from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.planners.baselines import baseline_policy, check_baseline
@@ -25,7 +26,6 @@ from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
 from rcdsac_trl.rollout.planners.cost_to_go import cost_to_go
 from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
 from rcdsac_trl.rollout.planners.local_map import LocalMap, LocalMapSettings
-from rcdsac_trl.rollout.planners.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
 from rcdsac_trl.rollout.planners.trajectory_costs import (
     PERIOD_S,

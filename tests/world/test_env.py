@@ -4,6 +4,7 @@ import itertools
 import math
 import os
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,12 +12,17 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, StepCounter, Transform
 from torchrl.envs.utils import check_env_specs
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
+from rcdsac_trl.robot.observation import range_distances
+from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.rollout.planners.pursuit import pursuit_action
 from rcdsac_trl.seeding import torch_stream
 from rcdsac_trl.system import cgroups
 from rcdsac_trl.system.processes import resolve_num_workers
 from rcdsac_trl.world.maps.generator import LAYOUTS, MapSettings
 from rcdsac_trl.world.task.env import NavigationEnv, make_env
+from rcdsac_trl.world.task.episode import draw_motor_steps
 from rcdsac_trl.world.task.rules import TaskSettings
 
 SMALL = MapSettings(size_m=12.0, layouts=("clutter",), clutter_per_m2=0.08, num_movers=1)
@@ -53,6 +59,29 @@ def test_specs_hold_for_every_sensor_and_map(sensor: str, layout: str, num_mover
     env = NavigationEnv(map_settings=settings, sensor=sensor, agent_ids=(0, 1))
     check_env_specs(env, seed=0)
     env.close()
+
+
+@pytest.mark.parametrize("sensor", ["narrow", "sparse", "full"])
+def test_what_is_remembered_is_told_and_changes_nothing_else(sensor: str) -> None:
+    """It is what the class makes of the sensed ranges and measured velocities, and of them alone."""
+    env = NavigationEnv(map_settings=SMALL, sensor=sensor, agent_ids=(0, 1), memory_s=9.0)
+    check_env_specs(env, seed=0)
+    env.set_seed(0)
+    told = drive(env, 60)
+    without = NavigationEnv(map_settings=SMALL, sensor=sensor, agent_ids=(0, 1))
+    assert_equal(told.exclude("remembered"), drive(without, 60))
+    for agent_id in (0, 1):
+        memory = RememberedRanges(sensor_mask(sensor), 9.0)
+        period_s = MOTOR_PERIOD_S * draw_motor_steps(TaskSettings(), "train", 0, 0, agent_id)
+        for step, now in enumerate(told[agent_id]):
+            seen_m = range_distances(now["range"].numpy())
+            v, omega, *_ = now["velocity"].tolist()
+            expected = memory.observe(seen_m, v, omega, period_s if step else 0.0)
+            # Observations are rounded: now and then a point lies in the next cell, or an edge in the next sector.
+            assert (np.abs(now["remembered"].numpy() - expected) > 1e-3).sum() <= 4
+    assert told["remembered"][:, -1].count_nonzero() > 0
+    env.close()
+    without.close()
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])

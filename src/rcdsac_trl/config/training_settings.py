@@ -21,9 +21,14 @@ Workers = int | Literal["auto"]
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """Which bins of the range sensor are seen (``conf/sensor``); :class:`WorldSettings` knows the names."""
+    """Which bins of the range sensor are seen, and remembered for how long (``conf/sensor``).
+
+    :class:`WorldSettings` knows the names.
+    """
 
     name: str
+    # Runs of earlier versions name none: they remembered nothing.
+    memory_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -138,6 +143,7 @@ class TrainingSettings:
             map_settings=self.map,
             task=self.task,
             sensor=self.sensor.name,
+            memory_s=self.sensor.memory_s,
             num_agents=self.world.num_agents,
             num_workers=self.world.num_workers,
             worker_timeout_s=self.world.worker_timeout_s,

@@ -88,6 +88,7 @@ def _described(
         "agent": trained.algo.name,
         "measure": trained.algo.distortion.name,
         "sensor": trained.sensor.name,
+        "memory_s": trained.sensor.memory_s,
         "train_seed": trained.seed,
         "checkpoint": settings.checkpoint,
         "split": settings.split,
@@ -117,6 +118,7 @@ def _driver(
         map_settings=trained.map,
         task=trained.task,
         sensor=trained.sensor.name,
+        memory_s=trained.sensor.memory_s,
         num_agents=group * len(conditions),
         num_workers=0,  # a process drives whole maps
     )

@@ -85,6 +85,7 @@ def _config(agent: AgentOfRun, num_critics: int, provenance: dict[str, str | int
         goal_radius_m=task.goal_radius_m,
         provenance=provenance,
         padding=agent.network.padding,
+        memory_s=agent.sensor.memory_s,
     )
 
 

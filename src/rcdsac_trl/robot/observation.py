@@ -28,10 +28,39 @@ WAYPOINT_DISTANCE_LIMITS_M = (0.01, 100.0)
 
 
 VECTOR_OBSERVATIONS: dict[str, int] = {"waypoint": 6, "velocity": 4}
-"""Name and size of every observation of an agent besides ``range``."""
+"""Name and size of every observation of the paper's agents besides ``range``."""
+
+
+NUM_REMEMBERED_SECTORS = 36
+"""Sectors of what is remembered, of 10 degrees: as wide as the robot in 3 m."""
+
+
+NUM_REMEMBERED_MOVERS = 2
+"""More things that move are seldom near at once."""
+
+
+REMEMBERED_MOVER_SIZE = 5
+"""Numbers for each of them."""
+
+
+REMEMBERED_SIZE = NUM_REMEMBERED_SECTORS + NUM_REMEMBERED_MOVERS * REMEMBERED_MOVER_SIZE
+"""Numbers that tell what is remembered; see :class:`rcdsac_trl.robot.remembered_ranges.RememberedRanges`."""
 
 Point = tuple[float, float]
 """x and y in the map frame, m."""
+
+
+def vector_observations(memory_s: float) -> dict[str, int]:
+    """Return name and size of every observation of an agent besides ``range``, in the order that networks read them in.
+
+    Args:
+        memory_s: for how long points are remembered, s; 0: nothing is remembered, as in the paper.
+
+    Example:
+        >>> vector_observations(0.0), vector_observations(12.0)["remembered"]
+        ({'waypoint': 6, 'velocity': 4}, 46)
+    """
+    return VECTOR_OBSERVATIONS | ({"remembered": REMEMBERED_SIZE} if memory_s > 0.0 else {})
 
 
 def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float32]:

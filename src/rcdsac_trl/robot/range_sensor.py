@@ -28,6 +28,22 @@ Sensor = Literal["narrow", "sparse", "full"]
 SENSORS: frozenset[str] = frozenset(get_args(Sensor))
 
 
+LONGEST_MEMORY_S = 3600.0
+"""Longer than an episode by far; more than that was meant in other units."""
+
+
+def check_memory(memory_s: float) -> None:
+    """Refuse a time that nothing can be remembered for.
+
+    Raises:
+        UserInputError: if it is negative, not finite, or above :data:`LONGEST_MEMORY_S`.
+    """
+    if not 0.0 <= memory_s <= LONGEST_MEMORY_S:
+        raise UserInputError(
+            f"sensor.memory_s={memory_s:g} is outside [0, {LONGEST_MEMORY_S:g}]: give seconds, 0 for no memory"
+        )
+
+
 def sensor_mask(name: str) -> NDArray[np.bool_]:
     """Return which of the 180 bins a sensor has, bool [180].
 

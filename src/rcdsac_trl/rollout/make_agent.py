@@ -13,7 +13,7 @@ from rcdsac_trl.agent.loss.target_updates import FusedAverage
 from rcdsac_trl.agent.transforms import Relabel
 from rcdsac_trl.config.learner_settings import LearnerSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
+from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.rollout.policies import AgentNoise, LeanPolicy, OnDevice
 from rcdsac_trl.seeding import torch_seed, torch_stream
 from rcdsac_trl.world.task.spaces import ACTION_SIZE
@@ -62,7 +62,7 @@ def unpacked_loss(settings: TrainingSettings, packed: bytes) -> LossModule:
 def _vectors(settings: TrainingSettings) -> dict[str, int]:
     """Name the vector observations of the networks, and their sizes."""
     weighted = settings.algo.collision_weight is not None
-    return VECTOR_OBSERVATIONS | ({"collision_weight": 1} if weighted else {})
+    return vector_observations(settings.sensor.memory_s) | ({"collision_weight": 1} if weighted else {})
 
 
 def _build_actor(settings: TrainingSettings) -> TensorDictSequential:

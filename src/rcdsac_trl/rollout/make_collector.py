@@ -32,7 +32,7 @@ from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.extras import needs
 from rcdsac_trl.system.processes import largest_divisor, resolve_num_workers, resolve_processes
 from rcdsac_trl.world.maps.generator import Split
-from rcdsac_trl.world.task.spaces import AGENT_OBSERVATIONS
+from rcdsac_trl.world.task.spaces import agent_observations
 
 SPLIT: Split = "train"
 
@@ -123,7 +123,7 @@ def _worker(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Dr
             return agents.rollout(
                 policy,
                 request.map_index,
-                observed=AGENT_OBSERVATIONS,
+                observed=agent_observations(settings.sensor.memory_s),
                 happened=HAPPENED,
                 before_step=before_step,
             )

@@ -18,7 +18,7 @@ from rcdsac_trl.agent.actor import STATE_KEY
 from rcdsac_trl.agent.transforms import EpisodeSampler
 from rcdsac_trl.system.interrupts import interruption_point
 from rcdsac_trl.world.task.env import COLLISION_WEIGHT, NavigationEnv
-from rcdsac_trl.world.task.spaces import ACTION_SIZE, AGENT_OBSERVATIONS
+from rcdsac_trl.world.task.spaces import ACTION_SIZE
 
 
 class EpisodeBatch(NamedTuple):
@@ -94,7 +94,7 @@ class RolloutWorker:
         context = {} if self.sampler is None else {self.sampler.key: self.sampler.told(episode)}
         weights = context[COLLISION_WEIGHT].view(-1).numpy() if COLLISION_WEIGHT in context else None
         # Made once: the agents write into the same arrays at every step.
-        now = TensorDict({key: torch.from_numpy(written[key]) for key in AGENT_OBSERVATIONS} | context, [number])
+        now = TensorDict({key: torch.from_numpy(written[key]) for key in agents.observations} | context, [number])
         now["is_init"] = torch.ones(number, 1, dtype=torch.bool, device="cpu")
         now[STATE_KEY] = torch.zeros(number, self.memory, dtype=torch.float32, device="cpu")
         seen = {key: _empty_rows(written[key], self.steps + 1) for key in observed}

@@ -5,7 +5,7 @@ Every observation is stored once. An episode of T transitions takes T + 1 slots 
 action and reward are padding that no sequence uses.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -104,11 +104,13 @@ class SequenceSampler(Sampler):
         """See :meth:`state_dict`."""
 
 
-def slot_spec(num_bins_kept: int, context_keys: tuple[str, ...]) -> dict[str, tuple[int, torch.dtype]]:
+def slot_spec(
+    num_bins_kept: int, context_keys: tuple[str, ...], vectors: Mapping[str, int] = VECTOR_OBSERVATIONS
+) -> dict[str, tuple[int, torch.dtype]]:
     """Return the features and type of every key of a slot; the memory of the replay follows from it."""
     spec = {
         "range": (num_bins_kept, torch.int16),
-        **{key: (size, torch.float32) for key, size in VECTOR_OBSERVATIONS.items()},
+        **{key: (size, torch.float32) for key, size in vectors.items()},
         "action": (ACTION_SIZE, torch.float32),
         "reward_rest": (1, torch.float32),
         "reward_collision": (1, torch.float32),
@@ -116,15 +118,23 @@ def slot_spec(num_bins_kept: int, context_keys: tuple[str, ...]) -> dict[str, tu
     return spec | dict.fromkeys(context_keys, (1, torch.float32))
 
 
-def bytes_per_slot(num_bins_kept: int, context_keys: tuple[str, ...]) -> int:
+def bytes_per_slot(
+    num_bins_kept: int, context_keys: tuple[str, ...], vectors: Mapping[str, int] = VECTOR_OBSERVATIONS
+) -> int:
     """Return how many bytes one stored agent step takes."""
-    return sum(n * dtype.itemsize for n, dtype in slot_spec(num_bins_kept, context_keys).values())
+    return sum(n * dtype.itemsize for n, dtype in slot_spec(num_bins_kept, context_keys, vectors).values())
 
 
-def replay_bytes(capacity_steps: int, episode_steps: int, num_bins_kept: int, context_keys: tuple[str, ...]) -> int:
+def replay_bytes(
+    capacity_steps: int,
+    episode_steps: int,
+    num_bins_kept: int,
+    context_keys: tuple[str, ...],
+    vectors: Mapping[str, int] = VECTOR_OBSERVATIONS,
+) -> int:
     """Return how many bytes a full replay takes, in memory and on the disk."""
     slots = capacity_steps // episode_steps * (episode_steps + 1)
-    return slots * bytes_per_slot(num_bins_kept, context_keys)
+    return slots * bytes_per_slot(num_bins_kept, context_keys, vectors)
 
 
 class SequenceReplay:
@@ -137,6 +147,7 @@ class SequenceReplay:
         batch_size: sequences of a batch, B.
         sensor_mask: bool ``[180]``, the bins the sensor keeps; only they are stored.
         context_keys: what else an episode holds constant and the networks read, such as ``"risk"``.
+        vectors: name and size of the observations besides `range`.
         seed: root seed; batches are drawn from its stream ``"replay"``.
         device: where sampled batches go; the storage stays in main memory.
 
@@ -153,6 +164,7 @@ class SequenceReplay:
         batch_size: int,
         sensor_mask: Tensor,
         context_keys: tuple[str, ...],
+        vectors: Mapping[str, int] = VECTOR_OBSERVATIONS,
         seed: int,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -162,6 +174,7 @@ class SequenceReplay:
             )
         self.codec = RangeCodec(sensor_mask)
         self.context_keys = context_keys
+        self.vectors = dict(vectors)
         self.episode_steps = episode_steps
         self.sequence_slots = sequence_length + 1
         self.batch_size = batch_size
@@ -185,7 +198,7 @@ class SequenceReplay:
         """Store whole episodes.
 
         Args:
-            episodes: ``[N, T]`` as the collector returns them, with `range`, `waypoint`, `velocity`, `action`,
+            episodes: ``[N, T]`` as the collector returns them, with `range`, the vectors, `action`,
                 the context keys, and in ``next`` the observations and `reward_components` (unscaled).
         """
         if episodes.shape[-1] != self.episode_steps:
@@ -195,8 +208,7 @@ class SequenceReplay:
         collision = components[..., [REWARD_COMPONENTS.index("collision")]]
         rest = torch.from_numpy(total_reward(components.numpy(), collision_weight=0.0)).unsqueeze(-1)
         slots = {
-            key: torch.cat([episodes[key], final["next", key].unsqueeze(1)], 1)
-            for key in ("range", *VECTOR_OBSERVATIONS)
+            key: torch.cat([episodes[key], final["next", key].unsqueeze(1)], 1) for key in ("range", *self.vectors)
         }
         slots["range"] = self.codec.encode(slots["range"])
         for key, value in {"action": episodes["action"], "reward_rest": rest, "reward_collision": collision}.items():
@@ -250,7 +262,7 @@ class SequenceReplay:
         """Return a batch of sequences.
 
         Returns:
-            TensorDict ``[B, L + 1]`` with `range`, `waypoint`, `velocity`, `action`, the context keys,
+            TensorDict ``[B, L + 1]`` with `range`, the vectors, `action`, the context keys,
             ``("next", "reward")`` (its collision part scaled by `collision_weight` where that is stored) and
             ``("next", "terminated")`` (always false: an episode is only ever truncated). In the last slot only
             the observation counts.
@@ -259,7 +271,7 @@ class SequenceReplay:
         slots = flat.reshape(self.batch_size, self.sequence_slots)
         weight = slots["collision_weight"] if "collision_weight" in self.context_keys else 1.0
         reward = slots["reward_rest"] + weight * slots["reward_collision"]
-        kept = {key: _step_by_step(slots[key]) for key in VECTOR_OBSERVATIONS} | {"action": slots["action"]}
+        kept = {key: _step_by_step(slots[key]) for key in self.vectors} | {"action": slots["action"]}
         # One value expanded: the loss then knows that a sequence shares it.
         kept |= {key: slots[key][:, :1].expand(-1, self.sequence_slots, -1) for key in self.context_keys}
         return TensorDict(

@@ -15,6 +15,7 @@ from rcdsac_trl.agent.kernels import matmul
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
 from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_run, training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, make_optimizer, make_relabel, packed, parameters
 from rcdsac_trl.rollout.make_collector import check_collector, make_episodes
@@ -81,7 +82,8 @@ def _replay_bytes(settings: TrainingSettings) -> int:
     algo = settings.algo
     keys = (algo.context_key,) if algo.context_key is not None else ()
     bins = int(sensor_mask(settings.sensor.name).sum())
-    return replay_bytes(settings.replay_steps, settings.task.episode_steps, bins, keys)
+    vectors = vector_observations(settings.sensor.memory_s)
+    return replay_bytes(settings.replay_steps, settings.task.episode_steps, bins, keys, vectors)
 
 
 def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
@@ -94,6 +96,7 @@ def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
         batch_size=settings.learner.batch_size,
         sensor_mask=torch.from_numpy(sensor_mask(settings.sensor.name)),
         context_keys=(algo.context_key,) if algo.context_key is not None else (),
+        vectors=vector_observations(settings.sensor.memory_s),
         seed=settings.seed,
         device=device,
     )

@@ -22,7 +22,7 @@ from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.policy.policy import fractions_of
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION
+from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, REMEMBERED_SIZE, vector_observations
 from rcdsac_trl.robot.range_sensor import NUM_BINS, sensor_mask
 
 LIMIT = 1e-5
@@ -69,7 +69,8 @@ def export_agent(weights: Weights, num_quantiles: int = 16) -> Exported:
         CriticStep(weights, torch.from_numpy(fractions)).eval(),
     )
     inputs = example_inputs(weights)
-    names = (_ACTOR_INPUTS, _ACTOR_OUTPUTS), (_CRITIC_INPUTS, _CRITIC_OUTPUTS)
+    more = ("remembered",) if weights.config.memory_s > 0.0 else ()
+    names = (_ACTOR_INPUTS + more, _ACTOR_OUTPUTS), (_CRITIC_INPUTS + more, _CRITIC_OUTPUTS)
     files: dict[str, bytes] = {}
     onnx: list[Runner] = []
     programs: list[Runner] = []
@@ -126,7 +127,7 @@ def differences(exported: Exported, weights: Weights, *, steps: int = 1000, num_
 
 def example_inputs(weights: Weights) -> dict[str, Array]:
     """Return one step's inputs of both programs by name, with their shapes: zeros."""
-    sizes = {"range": NUM_BINS, "waypoint": 6, "velocity": 4, "context": 1, "action": ACTION_SIZE}
+    sizes = {"range": NUM_BINS, "context": 1, "action": ACTION_SIZE} | vector_observations(weights.config.memory_s)
     given = {name: np.zeros((1, size), dtype=np.float32) for name, size in sizes.items()}
     actor, critics = _memory(weights)
     return given | {"memory": actor, "memories": critics}
@@ -147,6 +148,8 @@ def _observations(weights: Weights, context: float, steps: int, seed: int) -> It
         bearings = rng.uniform(-np.pi, np.pi, 2)
         waypoint = np.stack((rng.uniform(-1.0, 1.0, 2), np.cos(bearings), np.sin(bearings)), axis=1).ravel()
         arrays = {"range": bins, "waypoint": waypoint, "velocity": rng.uniform(-0.6, 0.6, 4)}
+        if weights.config.memory_s > 0.0:
+            arrays["remembered"] = rng.uniform(0.0, 1.0, REMEMBERED_SIZE)
         yield {name: value.astype(np.float32)[None] for name, value in arrays.items()} | {"context": told}
 
 
@@ -213,7 +216,7 @@ def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Run
 
     def told(inputs: dict[str, Array]) -> tuple[Array, float | None]:
         context = float(inputs["context"][0, 0])
-        vectors = [inputs["waypoint"][0], inputs["velocity"][0]]
+        vectors = [inputs[name][0] for name in vector_observations(config.memory_s)]
         if config.context == "collision_weight":
             vectors.append(inputs["context"][0])
         slope, offset = config.embedding or (0.0, 0.0)

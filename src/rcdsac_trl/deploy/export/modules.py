@@ -1,5 +1,6 @@
 """An agent as torch modules that take one step: what is exported, and what everything else is held against."""
 
+from collections.abc import Sequence
 from typing import Self
 
 import torch
@@ -35,7 +36,13 @@ class ActorStep(nn.Module):
         return cls(encoder, head, weighted=config.context == "collision_weight")
 
     def forward(
-        self, range_: Tensor, waypoint: Tensor, velocity: Tensor, context: Tensor, memory: Tensor
+        self,
+        range_: Tensor,
+        waypoint: Tensor,
+        velocity: Tensor,
+        context: Tensor,
+        memory: Tensor,
+        remembered: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return the action tanh(mean) [B, 2] and the encoder's next state, its memory, [B, memory].
 
@@ -45,9 +52,10 @@ class ActorStep(nn.Module):
             velocity: [B, 4].
             context: ``beta`` or the collision weight, [B, 1]; not read by an agent that is told neither.
             memory: [B, memory]; zeros at the start.
+            remembered: [B, 46], of an agent that is told what it saw.
         """
-        weight = context if self.weighted else None
-        read, after = _encode(self.encoder, range_, waypoint, velocity, weight, memory)
+        vectors = (waypoint, velocity, remembered, context if self.weighted else None)
+        read, after = _encode(self.encoder, range_, vectors, memory)
         loc, _ = self.head(read, None if self.head.measure is None else context)
         return torch.tanh(loc), after
 
@@ -75,7 +83,14 @@ class CriticStep(nn.Module):
             _load(self.heads[number], weights, f"critics.{number}.head")
 
     def forward(
-        self, range_: Tensor, waypoint: Tensor, velocity: Tensor, context: Tensor, action: Tensor, memories: Tensor
+        self,
+        range_: Tensor,
+        waypoint: Tensor,
+        velocity: Tensor,
+        context: Tensor,
+        action: Tensor,
+        memories: Tensor,
+        remembered: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return quantiles [B, N] (or the mean [B, 1]) and the next memories [critics, B, memory].
 
@@ -86,12 +101,13 @@ class CriticStep(nn.Module):
             context: as in :meth:`ActorStep.forward`, [B, 1].
             action: [B, 2].
             memories: [critics, B, memory]; zeros at the start.
+            remembered: as in :meth:`ActorStep.forward`.
         """
-        given = context if self.weighted else None
+        vectors = (waypoint, velocity, remembered, context if self.weighted else None)
         values, after = [], []
         for number, (encoder, head) in enumerate(zip(self.encoders, self.heads, strict=True)):
             assert isinstance(encoder, Encoder)
-            memory, state = _encode(encoder, range_, waypoint, velocity, given, memories[number])
+            memory, state = _encode(encoder, range_, vectors, memories[number])
             after.append(state)
             if isinstance(head, QuantileHead):
                 risk = None if head.measure is None else context.unsqueeze(1)
@@ -117,11 +133,10 @@ def _critic_head(config: AgentConfig, network: NetworkSettings) -> nn.Module:
 
 
 def _encode(
-    encoder: HistoryEncoder, range_: Tensor, waypoint: Tensor, velocity: Tensor, weight: Tensor | None, memory: Tensor
+    encoder: HistoryEncoder, range_: Tensor, vectors: Sequence[Tensor | None], memory: Tensor
 ) -> tuple[Tensor, Tensor]:
-    vectors = (waypoint, velocity) if weight is None else (waypoint, velocity, weight)
     is_first = torch.zeros(len(range_), 1, dtype=torch.bool)
-    return encoder.step(range_, *vectors, is_first, memory)
+    return encoder.step(range_, *(vector for vector in vectors if vector is not None), is_first, memory)
 
 
 def _load(module: nn.Module, weights: Weights, prefix: str) -> None:

@@ -1,6 +1,7 @@
 """The object that drives: observations in, a velocity command and the risk of it out, one call a control period."""
 
-from typing import Any
+import copy
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,9 @@ from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
 
+if TYPE_CHECKING:
+    from rcdsac_trl.robot.remembered_ranges import RememberedRanges
+
 # After so many calls without good input in a row, or so many of the longest periods of training without one, the memory
 # is of another situation.
 _FORGET_AFTER = 3
@@ -41,6 +45,15 @@ def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
     if num_quantiles < 1:
         raise UserInputError(f"num_quantiles={num_quantiles} is below 1: ask for at least one")
     return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
+
+
+def _memory_of(memory_s: float, sensed: NDArray[np.bool_]) -> "RememberedRanges | None":
+    """Make what remembers for so long, if anything does; alone of all that drives a robot, that needs numba."""
+    if memory_s == 0.0:
+        return None
+    from rcdsac_trl.robot.remembered_ranges import RememberedRanges
+
+    return RememberedRanges(sensed, memory_s)
 
 
 class Policy:
@@ -79,6 +92,7 @@ class Policy:
         self.default_beta = middle if self.config.context == "beta" else None
         self._default_weight = middle if self.config.context == "collision_weight" else None
         self._mask = sensor_mask(self.config.sensor)
+        self._remembered = _memory_of(self.config.memory_s, self._mask)
         parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
         self._encoders = Encoders(
             [weights.part(f"{part}.encoder") for part in parts], self._mask, weights.config.padding
@@ -99,6 +113,12 @@ class Policy:
         self._last_fresh: Stamps | None = None
         self._wanted: tuple[float, float] | None = None
         self._told: tuple[NDArray[np.float32] | None, float] | None = None
+
+    def __copy__(self) -> "Policy":
+        """Copy the situation, and share what never changes."""
+        copied = object.__new__(type(self))
+        copied.__dict__ |= self.__dict__ | {"_remembered": copy.deepcopy(self._remembered)}
+        return copied
 
     def foresee(self, beta: float | None = None, *, action: Any = None) -> Outlook:
         """Return what the agent would do with another `beta` where it stands now, and what it expects of that.
@@ -203,8 +223,9 @@ class Policy:
         self._last = stamps
         forgot = self._steps == 0
         if fresh:
+            elapsed_s = self._elapsed_s(stamps)
             self._last_fresh = stamps
-            self._ask(sectors, next_two, measured, context)
+            self._ask(sectors, next_two, measured, context, elapsed_s)
         return self._command(sectors, measured, fresh, fresh and forgot)
 
     def _is_due(self, stamps: Stamps | None) -> bool:
@@ -220,16 +241,27 @@ class Policy:
         # The recurrent network counts time in steps: a second look at one scan, or one in half the time, is none.
         return stamps.scan_s > last.scan_s and since > shortest / 2.0
 
+    def _elapsed_s(self, stamps: Stamps | None) -> float:
+        """Return the time since the last observation; without stamps it is about the middle of training's."""
+        if self._steps == 0:
+            return 0.0
+        if stamps is None or self._last_fresh is None:
+            return sum(self.config.period_s) / 2.0
+        return stamps.scan_s - self._last_fresh.scan_s
+
     def _ask(
         self,
         sectors: Sectors,
         waypoints: tuple[tuple[float, float], tuple[float, float]],
         measured: tuple[float, float],
         context: float | None,
+        elapsed_s: float,
     ) -> None:
         config = self.config
         bins = range_observation(sectors.distances_m, self._mask)
         vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
+        if self._remembered is not None:
+            vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s).tolist()
         if config.context == "collision_weight" and context is not None:
             vectors.append(context)
         self._memories = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._memories)
@@ -299,5 +331,7 @@ class Policy:
 
     def _forget(self) -> None:
         self._memories = np.zeros((self._encoders.number, self._encoders.size), dtype=np.float32)
+        if self._remembered is not None:
+            self._remembered.reset()
         self._commanded = (0.0, 0.0)
         self._steps = 0

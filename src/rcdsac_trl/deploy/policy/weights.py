@@ -21,12 +21,13 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
-from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS
+from rcdsac_trl.robot.observation import vector_observations
+from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS, check_memory
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
 
-FORMAT_VERSION = 2
-"""What is written. Format 1, which is read as well, does not say how its agents read the ring: without padding."""
+FORMAT_VERSION = 3
+"""What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
+_UNSAID: dict[int, dict[str, Any]] = {1: {"padding": "none", "memory_s": 0.0}, 2: {"memory_s": 0.0}, FORMAT_VERSION: {}}
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "weights.safetensors"
 CARD_NAME = "README.md"
@@ -61,6 +62,8 @@ class AgentConfig:
         goal_radius_m: a goal nearer than this is reached.
         provenance: where it comes from, for people: run, commit, checkpoint, steps.
         padding: how its convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
+        memory_s: for how long it is told of points that it saw, s; 0: not at all. See
+            :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`.
 
     Raises:
         UserInputError: if values do not fit together.
@@ -81,6 +84,7 @@ class AgentConfig:
     goal_radius_m: float
     provenance: Mapping[str, str | int | float | None]
     padding: Padding = "circular"
+    memory_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what no agent can be."""
@@ -103,6 +107,7 @@ class AgentConfig:
                 )
         if self.sensor not in SENSORS:
             raise UserInputError(f"sensor={self.sensor!r} does not exist; choose one of {', '.join(sorted(SENSORS))}")
+        check_memory(self.memory_s)
         if self.critic not in ("quantile", "scalar"):
             raise UserInputError(f"critic={self.critic!r} is neither 'quantile' nor 'scalar'")
         if set(self.network) != set(_WIDTHS) or not all(type(w) is int and w >= 1 for w in self.network.values()):
@@ -119,7 +124,8 @@ class AgentConfig:
     @property
     def vectors(self) -> dict[str, int]:
         """Name and size of the vector observations, in the order in which the encoders read them."""
-        return VECTOR_OBSERVATIONS | ({"collision_weight": 1} if self.context == "collision_weight" else {})
+        weighted = self.context == "collision_weight"
+        return vector_observations(self.memory_s) | ({"collision_weight": 1} if weighted else {})
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of every tensor of the agent, by name."""
@@ -238,14 +244,13 @@ def read_weights(folder: Path) -> Weights:
         version, digest = values.pop("format_version"), values.pop("weights_sha256")
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise UserInputError(f"{path} cannot be read ({type(error).__name__}): export the agent anew") from error
-    if version not in (1, FORMAT_VERSION):
+    if version not in _UNSAID:
         raise UserInputError(
-            f"{folder} is of format {version}, this version reads 1 and {FORMAT_VERSION}: export it anew"
+            f"{folder} is of format {version}, this version reads 1 to {FORMAT_VERSION}: export it anew"
         )
-    if set(values) != {field.name for field in fields(AgentConfig)} - ({"padding"} if version == 1 else set()):
+    if set(values) != {field.name for field in fields(AgentConfig)} - _UNSAID[version].keys():
         raise UserInputError(f"{path} does not have the keys of format {version}: export the agent anew")
-    if version == 1:
-        values["padding"] = "none"
+    values |= _UNSAID[version]
     try:
         content = (folder / WEIGHTS_NAME).read_bytes()
     except OSError as error:
@@ -311,6 +316,7 @@ def model_card(weights: Weights, results: str = "") -> str:
     if config.fixed_beta is not None:
         told += f"; it was trained for beta = {config.fixed_beta:g} alone"
     origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items() if value is not None)
+    remembered = f", what it saw in the last {config.memory_s:g} s" if config.memory_s > 0.0 else ""
     driving = f"\n{results.strip()}\n" if results else ""
     return f"""# {config.name}, {config.sensor} sensor
 
@@ -325,7 +331,7 @@ policy = rcdsac_trl.load("this/folder")
 
 | | |
 |---|---|
-| reads | {NUM_BINS} range bins of which the `{config.sensor}` sensor has some, two waypoints, velocities |
+| reads | {NUM_BINS} range bins of which the `{config.sensor}` sensor has some, two waypoints, velocities{remembered} |
 | is told | {told} |
 | risk measure | {config.measure} |
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.dead_reckoning import DeadReckoning
 from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 from rcdsac_trl.system.jit import njit
 
@@ -90,11 +91,10 @@ class LocalMap:
         self.settings = settings
         self.sensed = np.asarray(sensed, np.bool_)
         n = settings.num_cells
-        self.pose = np.zeros(3)
+        self._reckoning = DeadReckoning()
+        self.pose = self._reckoning.pose
         self.points = np.full((n, n, 3), _NEVER)
         self.field_m = np.full((n, n), settings.reach_m, np.float32)
-        self._time_s = 0.0
-        self._velocities = 0.0, 0.0
 
     def move(self, v: float, omega: float, elapsed_s: float) -> None:
         """Go with the robot.
@@ -104,11 +104,7 @@ class LocalMap:
             omega: angular velocity measured now, rad/s.
             elapsed_s: since the last move, s.
         """
-        before_v, before_omega = self._velocities
-        # Velocities are measured at an observation; in between the robot had about their mean.
-        _move(self.pose, 0.5 * (before_v + v) * elapsed_s, 0.5 * (before_omega + omega) * elapsed_s)
-        self._velocities = v, omega
-        self._time_s += elapsed_s
+        self._reckoning.move(v, omega, elapsed_s)
 
     def touch(self, ahead_m: float) -> None:
         """Remember something that was felt, not seen; the next observation clears it where it sees through it.
@@ -118,20 +114,20 @@ class LocalMap:
         """
         x, y, yaw = self.pose.tolist()
         place = x + ahead_m * math.cos(yaw), y + ahead_m * math.sin(yaw)
-        _put(self.points, *place, self._time_s, self.settings.cell_m)
+        _put(self.points, *place, self._reckoning.time_s, self.settings.cell_m)
 
     def observe(self, ranges_m: NDArray[np.float64], moving: NDArray[np.float64] = _NOTHING) -> None:
         """Forget what is old, clear what is seen through, and add what is seen but does not move.
 
         Args:
             ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m.
-            moving: what moves, float64 [k, 6]; see :attr:`.mover_tracks.MoverTracks.moving`.
+            moving: what moves, float64 [k, 6]; see :attr:`rcdsac_trl.robot.mover_tracks.MoverTracks.moving`.
         """
         settings = self.settings
-        _forget(self.points, self._time_s - settings.memory_s, self.pose, 0.5 * settings.size_m)
+        _forget(self.points, self._reckoning.time_s - settings.memory_s, self.pose, 0.5 * settings.size_m)
         _clear(self.points, self.pose, ranges_m, self.sensed, settings.clearing_margin_m)
-        _add(self.points, self._time_s, self.pose, ranges_m, self.sensed, settings.cell_m)
-        _take_out(self.points, self._time_s, moving, settings.mover_margin_m)
+        _add(self.points, self._reckoning.time_s, self.pose, ranges_m, self.sensed, settings.cell_m)
+        _take_out(self.points, self._reckoning.time_s, moving, settings.mover_margin_m)
         _measure(self.field_m, self.points, self.pose, settings.cell_m, settings.reach_m)
 
     @property
@@ -151,18 +147,6 @@ class LocalMap:
 
 # ------------------------------------------------------------------------------------------------ compiled
 # All that the compiled code uses stands in this file: Numba's cache notices no change of another one.
-@njit
-def _move(pose: np.ndarray, distance: float, turn: float) -> None:
-    """Move along an arc."""
-    middle = pose[2] + 0.5 * turn
-    # The chord of the arc; a turn of a step is small, so the sine's series is exact to rounding.
-    half = 0.5 * turn
-    chord = distance * (1.0 - half * half / 6.0)
-    pose[0] += chord * math.cos(middle)
-    pose[1] += chord * math.sin(middle)
-    pose[2] = (pose[2] + turn + math.pi) % (2.0 * math.pi) - math.pi
-
-
 @njit
 def _forget(points: np.ndarray, before_s: float, pose: np.ndarray, half_m: float) -> None:
     """Drop what is too old, and what is outside of the square."""

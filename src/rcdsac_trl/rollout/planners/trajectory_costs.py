@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.limits import DEAD_BAND, MAX_ANGULAR_ACCELERATION, MAX_LINEAR_ACCELERATION, MAX_LINEAR_VELOCITY
+from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.rollout.planners.cost_to_go import cost_to_go
 from rcdsac_trl.rollout.planners.local_map import LocalMap, LocalMapSettings
-from rcdsac_trl.rollout.planners.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.system.jit import njit
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE, TaskSettings

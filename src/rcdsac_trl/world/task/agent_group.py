@@ -19,7 +19,7 @@ from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task import rules
 from rcdsac_trl.world.task.episode import NavigationAgent
 from rcdsac_trl.world.task.rules import TaskSettings
-from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, Buffers
+from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, Buffers, agent_observations
 
 # What is written together, in the order in which an agent's numbers are gathered, and its columns there.
 _GATHERED = ("waypoint", "velocity", "pose", "reward_components", "contact", "goal_reached")
@@ -38,6 +38,7 @@ class AgentGroup(OfOneProcess):
         map_settings: how maps are generated.
         task: rules of the task.
         sensor: one of :data:`rcdsac_trl.robot.range_sensor.SENSORS`.
+        memory_s: for how long an agent is told of points that it saw, s; 0: not at all.
         split: which of the disjoint map sets.
         seed: root seed, at least 0.
         agent_ids: the agents' global numbers, at least 0; agents with equal numbers meet the same episodes.
@@ -46,6 +47,7 @@ class AgentGroup(OfOneProcess):
 
     Attributes:
         buffers: what the agents wrote last, overwritten by every reset and step.
+        observations: keys of it that a policy may see.
 
     Raises:
         UserInputError: a value is outside its limits.
@@ -57,6 +59,7 @@ class AgentGroup(OfOneProcess):
         task: TaskSettings | None,
         *,
         sensor: str,
+        memory_s: float,
         split: Split,
         seed: int,
         agent_ids: Sequence[int],
@@ -76,13 +79,15 @@ class AgentGroup(OfOneProcess):
                 mask,
                 split,
                 agent_id,
+                memory_s=memory_s,
                 gui=gui and row == 0,  # PyBullet opens one window a process
             )
             for row, agent_id in enumerate(agent_ids)
         ]
         self._mask = mask
         self._first_episode = _not_negative("first_episode", first_episode)
-        self.buffers = Buffers.zeros(len(agent_ids))
+        self.observations = agent_observations(memory_s)
+        self.buffers = Buffers.zeros(len(agent_ids), memory_s)
         self.set_seed(seed)
 
     def __len__(self) -> int:
@@ -162,6 +167,8 @@ class AgentGroup(OfOneProcess):
         at = slice(None) if len(rows) == len(self) else rows
         distances = np.array([agent.distances_m for agent in agents])
         buffers.range[at] = range_observation(distances, self._mask)
+        if buffers.remembered is not None:
+            buffers.remembered[at] = [agent.remembered for agent in agents]
         numbers = np.array(
             [
                 (

@@ -33,9 +33,9 @@ class NavigationEnv(OfOneProcess, EnvBase):
     reset of an agent begins its next episode. Whatever process holds an agent, and whatever the others do, its
     starts and goals are the same, and the same actions give bit-identical results.
 
-    Observations: ``range`` [180], ``waypoint`` [6], ``velocity`` [4], and for metrics and drawing only
-    ``pose`` [3] (x, y in m, yaw in rad, map frame), ``contact`` [1], ``goal_reached`` [1] and
-    ``reward_components`` [5].
+    Observations: ``range`` [180], ``waypoint`` [6], ``velocity`` [4], with ``memory_s`` above 0 ``remembered`` [46],
+    and for metrics and drawing only ``pose`` [3] (x, y in m, yaw in rad, map frame), ``contact`` [1],
+    ``goal_reached`` [1] and ``reward_components`` [5].
 
     Reward: the paper's (section Reward), from ``reward_components``.
 
@@ -80,6 +80,7 @@ class NavigationEnv(OfOneProcess, EnvBase):
             world.map_settings,
             world.task,
             sensor=world.sensor,
+            memory_s=world.memory_s,
             split=split,
             seed=seed,
             agent_ids=ids,
@@ -96,7 +97,7 @@ class NavigationEnv(OfOneProcess, EnvBase):
 
     def _make_specs(self) -> None:
         batch = self.batch_size
-        specs = {key: _torch_spec(space, batch) for key, space in SPACES.items()}
+        specs = {key: _torch_spec(SPACES[key], batch) for key, _ in self.agents.buffers.items()}
         reward = specs.pop("reward")
         if self._weighted:
             specs[COLLISION_WEIGHT] = Unbounded(shape=(*batch, 1), dtype=torch.float32, device=self.device)

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.robot.observation import Point, distance_and_bearing
+from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import MapSettings, Split, generate_map
 from rcdsac_trl.world.maps.planner import Planner
@@ -64,6 +66,7 @@ class NavigationAgent:
         mask: bins that the sensor has, bool [180].
         split: which of the disjoint map sets.
         agent_id: the agent's global number, which its random streams derive from.
+        memory_s: for how long it remembers points that it saw, s; 0: not at all.
         gui: show PyBullet's window.
 
     Attributes:
@@ -75,6 +78,8 @@ class NavigationAgent:
         reward_components: of the last step, see :func:`~rcdsac_trl.world.task.rules.reward_components`; zeros after
             a reset.
         distances_m: what the range sensor measures, float64 [180], m.
+        remembered: what it remembers, float32 [46], see
+            :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`; None without a memory.
     """
 
     pose: Pose
@@ -83,6 +88,7 @@ class NavigationAgent:
     goal_reached: bool
     reward_components: tuple[float, ...]
     distances_m: NDArray[np.float64]
+    remembered: NDArray[np.float32] | None
 
     def __init__(
         self,
@@ -91,6 +97,7 @@ class NavigationAgent:
         mask: NDArray[np.bool_],
         split: Split,
         agent_id: int,
+        memory_s: float = 0.0,
         gui: bool = False,
     ) -> None:
         self._map_settings = map_settings
@@ -99,6 +106,7 @@ class NavigationAgent:
         self._split = split
         self._agent_id = agent_id
         self._gui = gui
+        self._memory = RememberedRanges(mask, memory_s) if memory_s > 0.0 else None
         self._simulation: Simulation | None = None
         self._trail: deque[tuple[float, float]] = deque(maxlen=_TRAIL_STEPS)
 
@@ -122,7 +130,9 @@ class NavigationAgent:
         self.in_contact = self.goal_reached = False
         self.velocities = (0.0, 0.0, 0.0, 0.0)
         self.reward_components = (0.0,) * len(rules.REWARD_COMPONENTS)
-        self._sense()
+        if self._memory is not None:
+            self._memory.reset()
+        self._sense(elapsed_s=0.0)
 
     def step(self, action: Sequence[float]) -> None:
         """Take one agent step."""
@@ -145,7 +155,7 @@ class NavigationAgent:
             self._take_waypoints()
         v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, task.odometry_noise_std, self._noise)
         self.velocities = (v_c, omega_c, v_u, omega_u)
-        self._sense()
+        self._sense(elapsed_s=self._motor_steps * MOTOR_PERIOD_S)
 
     @property
     def next_waypoints(self) -> tuple[Point, Point]:
@@ -208,8 +218,11 @@ class NavigationAgent:
     def _distance_to(self, point: Point) -> float:
         return math.hypot(point[0] - self.pose[0], point[1] - self.pose[1])
 
-    def _sense(self) -> None:
+    def _sense(self, elapsed_s: float) -> None:
         self._trail.append(self.pose[:2])
         task = self._task
         distances = self._require_simulation().scan()
         self.distances_m = rules.noisy_ranges(distances, task.range_noise_std_m, task.range_dropout, self._noise)
+        v_c, omega_c, _, _ = self.velocities
+        memory = self._memory
+        self.remembered = None if memory is None else memory.observe(self.distances_m, v_c, omega_c, elapsed_s)

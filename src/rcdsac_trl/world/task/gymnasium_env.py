@@ -12,7 +12,7 @@ from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task import gymnasium_id
 from rcdsac_trl.world.task.agent_group import AgentGroup
-from rcdsac_trl.world.task.spaces import ACTION_SIZE, AGENT_OBSERVATIONS, SPACES
+from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, agent_observations
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 FRAMES_PER_S = 7  # a control period is 0.14 s on average
@@ -21,7 +21,8 @@ FRAMES_PER_S = 7  # a control period is 0.14 s on average
 class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
     """One agent of :class:`~rcdsac_trl.world.task.env.NavigationEnv`, with the same episodes and numbers.
 
-    Observations: a dict of ``range`` [180], ``waypoint`` [6] and ``velocity`` [4], float32.
+    Observations: a dict of ``range`` [180], ``waypoint`` [6], ``velocity`` [4] and, with ``memory_s`` above 0,
+    ``remembered`` [46], float32.
 
     Info: ``pose`` [3] (x, y in m, yaw in rad), ``contact``, ``goal_reached``, ``reward_components`` [5], and the
     ``seed`` and ``episode`` that map, start, goals and movers derive from.
@@ -64,16 +65,18 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserInputError(f"render_mode={render_mode!r} does not exist; use 'rgb_array' or None")
+        world = replace(world or WorldSettings(), **changes)
+        self._observed = agent_observations(world.memory_s)
         self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
-            {key: _box(key) for key in AGENT_OBSERVATIONS}
+            {key: _box(key) for key in self._observed}
         )
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         self.render_mode = render_mode
-        world = replace(world or WorldSettings(), **changes)
         self._agents = AgentGroup(
             world.map_settings,
             world.task,
             sensor=world.sensor,
+            memory_s=world.memory_s,
             split=split,
             seed=0 if seed is None else seed,
             agent_ids=(agent_id,),
@@ -124,7 +127,7 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         return int(np.random.SeedSequence().generate_state(1)[0]) >> 1
 
     def _observation(self) -> dict[str, np.ndarray]:
-        return {key: getattr(self._agents.buffers, key)[0].copy() for key in AGENT_OBSERVATIONS}
+        return {key: getattr(self._agents.buffers, key)[0].copy() for key in self._observed}
 
     def _info(self) -> dict[str, Any]:
         buffers = self._agents.buffers

@@ -6,11 +6,12 @@ Both adapters, TorchRL's and Gymnasium's, build their specs from :data:`SPACES` 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.robot.observation import RANGE_OFFSET, VECTOR_OBSERVATIONS, WAYPOINT_DISTANCE_LIMITS_M
+from rcdsac_trl.robot.observation import RANGE_OFFSET, REMEMBERED_SIZE, WAYPOINT_DISTANCE_LIMITS_M, vector_observations
 from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
 from rcdsac_trl.world.task.rules import REWARD_COMPONENTS
 
@@ -54,13 +55,22 @@ _FASTEST = 10.0
 _LOG_NEAR, _LOG_FAR = (math.log10(limit) for limit in WAYPOINT_DISTANCE_LIMITS_M)
 
 ACTION_SIZE = 2
-AGENT_OBSERVATIONS = ("range", *VECTOR_OBSERVATIONS)
-"""What a policy may see; the other keys are for metrics and drawing."""
+
+
+def agent_observations(memory_s: float) -> tuple[str, ...]:
+    """Return the keys that a policy may see; the others are for metrics and drawing.
+
+    Args:
+        memory_s: for how long points are remembered, s; 0: nothing is.
+    """
+    return "range", *vector_observations(memory_s)
+
 
 SPACES: dict[str, Space] = {
     "range": _numbers([0.0] * NUM_BINS, [RANGE_OFFSET + math.log10(MAX_RANGE_M)] * NUM_BINS),
     "waypoint": _numbers([_LOG_NEAR, -1.0, -1.0] * 2, [_LOG_FAR, 1.0, 1.0] * 2),
     "velocity": _numbers([-_FASTEST] * 4, [_FASTEST] * 4),
+    "remembered": _unlimited(REMEMBERED_SIZE),
     "pose": _unlimited(3),
     "contact": _FLAG,
     "goal_reached": _FLAG,
@@ -71,7 +81,11 @@ SPACES: dict[str, Space] = {
 
 @dataclass(frozen=True)
 class Buffers:
-    """What a group of agents writes at every step: one array a key of :data:`SPACES`, one row an agent."""
+    """What a group of agents writes at every step: one array a key of :data:`SPACES`, one row an agent.
+
+    Attributes:
+        remembered: None where nothing is remembered; every other key is always there.
+    """
 
     range: NDArray[np.float32]
     waypoint: NDArray[np.float32]
@@ -81,12 +95,15 @@ class Buffers:
     goal_reached: NDArray[np.bool_]
     reward_components: NDArray[np.float32]
     reward: NDArray[np.float32]
+    remembered: NDArray[np.float32] | None
 
     @classmethod
-    def zeros(cls, num_agents: int) -> "Buffers":
-        """Allocate the arrays for a number of agents."""
-        return cls(**{key: np.zeros((num_agents, s.size), s.dtype) for key, s in SPACES.items()})
+    def zeros(cls, num_agents: int, memory_s: float) -> "Buffers":
+        """Allocate the arrays for a number of agents that remember for so long, s."""
+        arrays: dict[str, Any] = {key: np.zeros((num_agents, s.size), s.dtype) for key, s in SPACES.items()}
+        return cls(**arrays if memory_s > 0.0 else arrays | {"remembered": None})
 
     def items(self) -> Iterator[tuple[str, NDArray]]:
         """Iterate over keys and arrays."""
-        return ((field.name, getattr(self, field.name)) for field in fields(self))
+        named = ((field.name, getattr(self, field.name)) for field in fields(self))
+        return ((name, array) for name, array in named if array is not None)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import SENSORS
+from rcdsac_trl.robot.range_sensor import SENSORS, check_memory
 from rcdsac_trl.system.checks import positive
 from rcdsac_trl.system.processes import resolve_num_workers
 from rcdsac_trl.world.maps.generator import MapSettings
@@ -19,6 +19,8 @@ class WorldSettings:
         map_settings: how maps are generated.
         task: rules of the task.
         sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
+        memory_s: for how long an agent is told of points that it saw and no longer sees, s; 0: not at all, as in the
+            paper. See :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`.
         num_agents: agents side by side on each map.
         num_workers: processes of :func:`~rcdsac_trl.world.task.env.make_env`: 0 for none, W >= 1 for a ``ParallelEnv``
             of W with ``num_agents / W`` agents each; ``"auto"`` takes for W the largest divisor of ``num_agents`` that
@@ -37,6 +39,7 @@ class WorldSettings:
     map_settings: MapSettings = field(default_factory=MapSettings)
     task: TaskSettings = field(default_factory=TaskSettings)
     sensor: str = "narrow"
+    memory_s: float = 0.0
     num_agents: int = 10
     num_workers: int | Literal["auto"] = "auto"
     worker_timeout_s: float | None = None
@@ -46,6 +49,7 @@ class WorldSettings:
         """Refuse an unknown sensor and agents that the workers cannot share."""
         if self.sensor not in SENSORS:
             raise UserInputError(f"sensor.name={self.sensor} is unknown: choose one of {', '.join(sorted(SENSORS))}")
+        check_memory(self.memory_s)
         if self.num_agents < 1:
             raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
         resolve_num_workers(self.num_workers, self.num_agents)

@@ -1,0 +1,219 @@
+"""What a robot remembers of what it saw, as an agent is told it; our option beyond the paper (``sensor.memory_s``).
+
+It knows what a robot knows: the sectors that its sensor has, and measured velocities. Points that were seen are carried
+along by dead reckoning, cleared by sectors that see farther, and forgotten after a while; what walks is tracked instead
+and goes on at its velocity while it is out of view. The simulated world and the policy on a robot run the same code.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.robot.dead_reckoning import DeadReckoning
+from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
+from rcdsac_trl.robot.observation import (
+    NUM_REMEMBERED_MOVERS,
+    NUM_REMEMBERED_SECTORS,
+    REMEMBERED_MOVER_SIZE,
+    REMEMBERED_SIZE,
+)
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.system.jit import njit
+
+_SECTOR_RAD = 2.0 * math.pi / NUM_REMEMBERED_SECTORS
+# A cell holds the last point seen in it; the ring of cells is wider than what is remembered, 3 m around the robot.
+_CELL_M = 0.1
+# A point stands for what is around it, up to the points of the next cells.
+_POINT_RADIUS_M = 0.07
+_NUM_CELLS = 64
+# A remembered point goes when its sector sees this much farther: about what cell, sector and odometry have moved it by.
+_CLEARING_MARGIN_M = 0.1
+# Points this near to a thing that moves are its own: about what its place is uncertain by.
+_MOVER_MARGIN_M = 0.2
+# Nearness counts from a circle inside the robot, whose sides are 0.23 m from its middle, so that it changes fast where
+# the robot nearly touches; what is nearer to that circle than the second distance is alike.
+_INNER_RADIUS_M = 0.2
+_LEAST_GAP_M = 0.02
+
+
+class RememberedRanges:
+    """What one robot remembers.
+
+    Args:
+        sensed: which of the 180 sectors the sensor has, bool [180].
+        memory_s: age at which a point is forgotten, above 0, s.
+
+    Example:
+        >>> from rcdsac_trl.robot.range_sensor import sensor_mask
+        >>> remembered = RememberedRanges(sensor_mask("narrow"), memory_s=12.0)
+        >>> ranges_m = np.full(180, np.inf)
+        >>> ranges_m[0] = 0.48
+        >>> told = remembered.observe(ranges_m, v=0.0, omega=0.0, elapsed_s=0.0)
+        >>> told.shape, round(float(told[0]), 6)
+        ((46,), 1.0)
+    """
+
+    def __init__(self, sensed: NDArray[np.bool_], memory_s: float) -> None:
+        self._sensed = np.ascontiguousarray(sensed, np.bool_)
+        self._memory_s = memory_s
+        # Rows of x and y in m, frame of the dead reckoning, and when it was seen, s; a row for every cell at most.
+        self._points = np.empty((_NUM_CELLS**2, 3))
+        self._cells = np.empty((_NUM_CELLS**2, 2), np.int32)  # of each point
+        self._rows = np.full((_NUM_CELLS, _NUM_CELLS), -1, np.int32)  # of each cell's point, -1 without one
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._rows.fill(-1)
+        self._number = 0
+        self._reckoning = DeadReckoning()
+        self._tracks = MoverTracks(TrackSettings(), self._sensed)
+
+    def observe(self, ranges_m: NDArray[np.float64], v: float, omega: float, elapsed_s: float) -> NDArray[np.float32]:
+        """Move on, take in what is seen now, and return what is remembered.
+
+        Args:
+            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m. Those
+                that the sensor lacks are not read.
+            v: linear velocity measured now, m/s.
+            omega: angular velocity measured now, rad/s.
+            elapsed_s: since the last observation, 0 at the first, s.
+
+        Returns:
+            float32 [46]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
+            degrees, counter-clockwise from straight ahead: log10(2.8 m / (distance - 0.2 m)), 0 where nothing is known
+            within 3 m.
+            Then, for each of the two nearest things that move: its nearness, that times the cosine and the sine of its
+            bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
+        """
+        self._reckoning.move(v, omega, elapsed_s)
+        seen_m = np.where(self._sensed, ranges_m, np.inf)
+        pose, time_s = self._reckoning.pose, self._reckoning.time_s
+        self._tracks.observe(seen_m, pose, elapsed_s)
+        moving = self._tracks.moving
+        told = np.zeros(REMEMBERED_SIZE, np.float32)
+        points, cells, rows = self._points, self._cells, self._rows
+        number = _forget(points, cells, rows, self._number, pose, time_s - self._memory_s, seen_m, self._sensed, moving)
+        self._number = _add(points, cells, rows, number, pose, time_s, seen_m, self._sensed, moving)
+        _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose)
+        _tell_movers(told, moving, pose)
+        return told
+
+
+# ------------------------------------------------------------------------------------------------ compiled
+# All that the compiled code uses stands in this file: Numba's cache notices no change of another one.
+@njit
+def _forget(
+    points: np.ndarray,
+    cells: np.ndarray,
+    rows: np.ndarray,
+    number: int,
+    pose: np.ndarray,
+    before_s: float,
+    seen_m: np.ndarray,
+    sensed: np.ndarray,
+    moving: np.ndarray,
+) -> int:
+    """Drop what is old, far, seen through, or a mover's; return how many points are left, in the first rows."""
+    for row in range(number - 1, -1, -1):
+        x, y, time_s = points[row]
+        distance_m = math.hypot(x - pose[0], y - pose[1])
+        gone = time_s < before_s or distance_m >= MAX_RANGE_M
+        if not gone:
+            bin_ = math.floor((math.atan2(y - pose[1], x - pose[0]) - pose[2]) / BIN_RAD) % NUM_BINS
+            seen_through = distance_m < min(seen_m[bin_], MAX_RANGE_M) - _CLEARING_MARGIN_M
+            gone = (sensed[bin_] and seen_through) or _is_of_a_mover(x, y, moving, False)
+        if gone:
+            rows[cells[row, 0], cells[row, 1]] = -1
+            number -= 1
+            if row != number:
+                points[row], cells[row] = points[number], cells[number]
+                rows[cells[row, 0], cells[row, 1]] = row
+    return number
+
+
+@njit
+def _add(
+    points: np.ndarray,
+    cells: np.ndarray,
+    rows: np.ndarray,
+    number: int,
+    pose: np.ndarray,
+    time_s: float,
+    seen_m: np.ndarray,
+    sensed: np.ndarray,
+    moving: np.ndarray,
+) -> int:
+    """Put a point into the middle of each sector that sees one, but for movers that are seen; return how many are."""
+    for bin_ in range(NUM_BINS):
+        if not sensed[bin_] or seen_m[bin_] >= MAX_RANGE_M:
+            continue
+        bearing = pose[2] + (bin_ + 0.5) * BIN_RAD
+        x, y = pose[0] + seen_m[bin_] * math.cos(bearing), pose[1] + seen_m[bin_] * math.sin(bearing)
+        if _is_of_a_mover(x, y, moving, True):
+            continue
+        i, j = math.floor(y / _CELL_M) % _NUM_CELLS, math.floor(x / _CELL_M) % _NUM_CELLS
+        row = rows[i, j]
+        if row < 0:
+            row = rows[i, j] = number
+            cells[row, 0], cells[row, 1] = i, j
+            number += 1
+        points[row, 0], points[row, 1], points[row, 2] = x, y, time_s
+    return number
+
+
+@njit
+def _is_of_a_mover(x: float, y: float, moving: np.ndarray, seen_now: bool) -> bool:
+    """Say whether a point belongs to what moves; where that is itself not seen its place is a guess."""
+    for mover_x, mover_y, _, _, radius, unseen_s in moving:
+        near = math.hypot(x - mover_x, y - mover_y) < radius + _MOVER_MARGIN_M
+        if near and (unseen_s == 0.0 or not seen_now):
+            return True
+    return False
+
+
+@njit
+def _nearness(distance_m: float) -> float:
+    """Return 0 at 3 m, 1 at 0.48 m, 2 at 0.23 m, from the robot's middle."""
+    return math.log10(
+        (MAX_RANGE_M - _INNER_RADIUS_M) / (max(distance_m, _INNER_RADIUS_M + _LEAST_GAP_M) - _INNER_RADIUS_M)
+    )
+
+
+@njit
+def _cover(told: np.ndarray, bearing: float, radius_m: float, centre_m: float, nearness: float) -> None:
+    """Raise the sectors that a disc covers to its nearness."""
+    half = math.asin(min(1.0, radius_m / max(centre_m, radius_m)))
+    first, last = math.floor((bearing - half) / _SECTOR_RAD), math.floor((bearing + half) / _SECTOR_RAD)
+    for sector in range(first, last + 1):
+        told[sector % NUM_REMEMBERED_SECTORS] = max(told[sector % NUM_REMEMBERED_SECTORS], nearness)
+
+
+@njit
+def _tell_points(told: np.ndarray, points: np.ndarray, pose: np.ndarray) -> None:
+    """Write the nearness of the nearest point of each sector."""
+    for x, y, _ in points:
+        distance_m, bearing = math.hypot(x - pose[0], y - pose[1]), math.atan2(y - pose[1], x - pose[0]) - pose[2]
+        _cover(told, bearing, _POINT_RADIUS_M, distance_m, _nearness(distance_m))
+
+
+@njit
+def _tell_movers(told: np.ndarray, moving: np.ndarray, pose: np.ndarray) -> None:
+    """Write what moves into the sectors that it covers, and the nearest ones behind them."""
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    centres_m = np.hypot(moving[:, 0] - pose[0], moving[:, 1] - pose[1])
+    order = np.argsort(centres_m)
+    for place in range(len(order)):
+        x, y, vx, vy, radius, _ = moving[order[place]]
+        dx, dy, centre_m = x - pose[0], y - pose[1], centres_m[order[place]]
+        nearness = _nearness(centre_m - radius)
+        if nearness <= 0.0:
+            break  # those behind it are farther away, movers are alike
+        bearing = math.atan2(dy, dx) - pose[2]
+        _cover(told, bearing, radius, centre_m, nearness)
+        if place < NUM_REMEMBERED_MOVERS:
+            at = NUM_REMEMBERED_SECTORS + REMEMBERED_MOVER_SIZE * place
+            told[at] = nearness
+            told[at + 1], told[at + 2] = nearness * math.cos(bearing), nearness * math.sin(bearing)
+            told[at + 3], told[at + 4] = cos * vx + sin * vy, cos * vy - sin * vx
