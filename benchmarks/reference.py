@@ -241,14 +241,14 @@ class ReferenceLoss(LossModule):
 
 
 class ReferenceLearner:
-    """One plain update: sample, relabel, three losses, an Adam for each, target critics, the actor's average.
+    """One plain update: sample, mirror, relabel, three losses, an Adam for each, target critics, the actor's average.
 
     Args:
-        learner: the product's; lends its replay, its relabelling, its weights and its settings.
+        learner: the product's; lends its replay, its mirror, its relabelling, its weights and its settings.
     """
 
     def __init__(self, learner: Learner) -> None:
-        self.replay, self.relabel = learner.replay, learner.relabel
+        self.replay, self.mirror, self.relabel = learner.replay, learner.mirror, learner.relabel
         self.loss = ReferenceLoss(learner.loss, torch.Generator().manual_seed(0))
         groups = [list(self.loss.actor_network_params.parameters()), list(self.loss.critic_network_params.parameters())]
         rates = [group["lr"] for group in learner.optimizer.param_groups]
@@ -262,6 +262,8 @@ class ReferenceLearner:
     def update(self) -> None:
         """Do one update."""
         batch = self.replay.sample()
+        if self.mirror is not None:
+            batch = self.mirror(batch)
         if self.relabel is not None:
             batch = self.relabel(batch)
         losses = self.loss(batch)

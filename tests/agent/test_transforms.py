@@ -1,5 +1,6 @@
 """What agents are told for an episode, and what an update relabels."""
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -9,8 +10,11 @@ from torchrl.envs.utils import check_env_specs
 
 from rcdsac_trl.agent.actor import recurrent_state_primer
 from rcdsac_trl.agent.risk import PowerLaw
-from rcdsac_trl.agent.transforms import EpisodeSampler, Relabel
+from rcdsac_trl.agent.transforms import EpisodeSampler, Mirror, Relabel
+from rcdsac_trl.robot.observation import range_observation, waypoint_observation
+from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.seeding import stream
+from rcdsac_trl.world.sim.lidar import sector_distances
 
 AGENTS = 4
 
@@ -175,3 +179,42 @@ def test_stored_and_fixed() -> None:
         Relabel(PowerLaw(), mode="fixed")
     with pytest.raises(ValueError, match="needs a generator"):
         Relabel(PowerLaw(), mode="resample")
+
+
+# ------------------------------------------------------------------------------------------------ left and right
+@pytest.mark.parametrize("sensor", ["full", "narrow", "sparse"])
+def test_the_mirrored_world_is_told_mirrored(sensor: str) -> None:
+    """What the functions of the observation say of a mirrored scene is the mirrored observation."""
+    rng = np.random.default_rng(0)
+    mask = sensor_mask(sensor)
+    circles = np.column_stack([rng.uniform(-2.5, 2.5, (12, 2)), rng.uniform(0.05, 0.2, 12)])
+    circles = circles[np.hypot(circles[:, 0], circles[:, 1]) > 0.5]
+    waypoints = rng.uniform(-3.0, 3.0, (2, 2))
+    told = []
+    for side in (1.0, -1.0):
+        scene = circles * [1.0, side, 1.0]
+        seen = range_observation(sector_distances(0.0, 0.0, 0.0, np.empty((0, 4)), scene), mask)
+        places = [(x, side * y) for x, y in waypoints.tolist()]
+        waypoint = waypoint_observation((0.0, 0.0, 0.0), places[0], places[1])
+        sided = {"velocity": [0.3, 0.5 * side, 0.4, 0.6 * side], "action": [0.1, 0.7 * side]}
+        arrays = {"range": seen, "waypoint": waypoint, **sided}
+        rows = {key: torch.tensor(np.asarray(value, np.float32)).expand(2, 3, -1) for key, value in arrays.items()}
+        told.append(TensorDict(rows, [2, 3]).clone())
+    batch = Mirror(torch.from_numpy(mask))(told[0].clone())
+    assert (batch[1] == told[0][1]).all()  # the second half stays
+    for key in ("waypoint", "velocity", "action"):
+        torch.testing.assert_close(batch[key][0], told[1][key][0])
+    equal = (batch["range"][0, 0] - told[1]["range"][0, 0]).abs().numpy() < 1e-5
+    off = {"full": 0, "narrow": 1, "sparse": 18}[sensor]  # bins that are read 2 degrees off
+    assert (~equal).sum() <= off
+    assert (batch["range"][0, 0].numpy() > 0).sum() > 0
+    assert not batch["range"][0, 0].numpy()[~mask].any()
+
+
+def test_mirroring_twice_changes_nothing() -> None:
+    keys = {"range": 180, "waypoint": 6, "velocity": 4, "remembered": 46, "action": 2}
+    batch = TensorDict({key: torch.randn(2, 3, size) for key, size in keys.items()}, [2, 3])
+    mirror = Mirror(torch.ones(180, dtype=torch.bool))
+    once = mirror(batch.clone())
+    assert not any((once[key][0] == batch[key][0]).all() for key in keys)
+    assert (mirror(once) == batch).all()

@@ -1,4 +1,4 @@
-"""Where beta comes from: drawn for an episode while collecting, set for a batch while updating."""
+"""What happens to data: where beta comes from, in an episode and in a batch, and left and right of a batch."""
 
 from collections.abc import Callable, Sequence
 from typing import Literal
@@ -10,6 +10,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.robot.mirror import MIRRORED, mirrored_bins
 from rcdsac_trl.seeding import stream
 
 
@@ -141,4 +142,36 @@ class Relabel:
         if self.mode == "resample" and self.generator is not None:
             drawn = self.measure.sample((sequences, slots if self.per == "transition" else 1, 1), self.generator)
             return batch.set("risk", drawn.expand(sequences, slots, 1))
+        return batch
+
+
+class Mirror:
+    """Exchanges left and right in half of a batch's sequences, which are as random as all of them.
+
+    Args:
+        sensed: bins that the sensor has, bool ``[180]``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> mirror = Mirror(torch.ones(180, dtype=torch.bool))
+        >>> batch = TensorDict({"range": torch.zeros(2, 9, 180), "action": torch.ones(2, 9, 2)}, batch_size=[2, 9])
+        >>> mirror(batch)["action"][:, 0].tolist()
+        [[1.0, -1.0], [1.0, 1.0]]
+    """
+
+    def __init__(self, sensed: Tensor) -> None:
+        self._bins = torch.from_numpy(mirrored_bins(sensed.numpy()))
+        self._others = {
+            key: (torch.from_numpy(order), torch.from_numpy(sign)) for key, (order, sign) in MIRRORED.items()
+        }
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Mirror the first half of the sequences ``[B, L + 1]`` in place."""
+        half, device = batch.shape[0] // 2, batch["action"].device
+        seen = batch["range"][:half]
+        seen.copy_(seen[..., self._bins.to(device)])
+        for key, (order, sign) in self._others.items():
+            if key in batch.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)
+                value = batch[key][:half]
+                value.copy_(value[..., order.to(device)] * sign.to(device))
         return batch

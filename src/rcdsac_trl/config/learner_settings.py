@@ -25,6 +25,8 @@ class LearnerSettings(LossSettings):
     alpha_lr: float
     max_grad_norm: float | None
     resample_per: DrawnPer
+    # Runs of earlier versions name none: they had one side.
+    mirror: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values that cannot work."""

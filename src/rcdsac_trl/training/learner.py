@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule, SoftUpdate
 
-from rcdsac_trl.agent.transforms import Relabel
+from rcdsac_trl.agent.transforms import Mirror, Relabel
 from rcdsac_trl.rollout.make_agent import packed
 from rcdsac_trl.storage.replay import SequenceReplay
 from rcdsac_trl.system.interrupts import interruption_point
@@ -19,6 +19,7 @@ class Learner:
 
     Args:
         replay: gives batches of sequences.
+        mirror: exchanges left and right in half of a batch; None: it does not.
         loss: returns ``loss_qvalue``, ``loss_actor``, ``loss_alpha`` with isolated gradients, and diagnostics.
         relabel: sets the `risk` of a batch; None: the loss reads none.
         optimizer: holds the parameters of all three losses.
@@ -32,6 +33,7 @@ class Learner:
         self,
         *,
         replay: SequenceReplay,
+        mirror: Mirror | None,
         loss: LossModule,
         relabel: Relabel | None,
         optimizer: torch.optim.Optimizer,
@@ -41,6 +43,7 @@ class Learner:
         average: AveragedModel,
     ) -> None:
         self.replay = replay
+        self.mirror = mirror
         self.loss = loss
         self.relabel = relabel
         self.optimizer = optimizer
@@ -53,6 +56,8 @@ class Learner:
     def update(self) -> dict[str, Tensor]:
         """Do one update and return the losses and diagnostics, detached and still on the device."""
         batch: TensorDictBase = self.replay.sample()
+        if self.mirror is not None:
+            batch = self.mirror(batch)
         if self.relabel is not None:
             batch = self.relabel(batch)
         losses = self.loss(batch)

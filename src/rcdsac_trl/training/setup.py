@@ -13,6 +13,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.agent.kernels import matmul
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
+from rcdsac_trl.agent.transforms import Mirror
 from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_run, training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.robot.observation import vector_observations
@@ -105,8 +106,10 @@ def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
 def make_learner(settings: TrainingSettings, device: str) -> Learner:
     """Make the networks and all that updates them, with an empty replay."""
     loss = make_loss(settings, device)
+    sensed = torch.from_numpy(sensor_mask(settings.sensor.name))
     return Learner(
         replay=make_replay(settings, device),
+        mirror=Mirror(sensed) if settings.learner.mirror else None,
         loss=loss,
         relabel=make_relabel(settings, device),
         optimizer=make_optimizer(loss, settings.learner),
