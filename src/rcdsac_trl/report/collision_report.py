@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from rcdsac_trl.report.read import CONDITION, Episodes, read_evaluation, under
@@ -36,7 +37,7 @@ def collision_summary(
         The columns of `conditions`, `thing`, `collisions`; `per_episode`; `share` of the condition's collisions;
         `outside_share`, of these how many had the contact outside the sectors that the sensor has; `never_share`, how
         many hit what the agent had never sensed; `median_unsensed_s`, how long ago it last sensed it, where it ever
-        did.
+        did; `median_abs_bearing_rad` of the contact.
     """
     rows = []
     for _, condition in conditions.iterrows():
@@ -60,6 +61,7 @@ def _summed(part: pd.DataFrame, episodes: int, all_collisions: int) -> dict[str,
         "outside_share": 1.0 - part["bearing_sensed"].astype(float).mean(),
         "never_share": unsensed_s.isna().astype(float).mean(),
         "median_unsensed_s": unsensed_s.median(),
+        "median_abs_bearing_rad": part["bearing_rad"].astype(float).abs().median(),
     }
 
 
@@ -79,18 +81,22 @@ def wide(summary: pd.DataFrame) -> pd.DataFrame:
     """Lay the summary of a report out with a row a condition, as text."""
     rows = []
     for condition, parts in summary.groupby("condition", sort=False):
-        of = parts.set_index("thing")
-        total = of.loc[ALL]
-        row = {"condition": condition, "collisions an episode": f"{total['per_episode']:.2f}"}
-        row |= {name: f"{of['per_episode'].get(thing, 0.0):.2f}" for thing, name in THINGS.items()}
-        if total["collisions"]:
-            row |= {
-                "outside the sensor's sectors": f"{total['outside_share']:.0%}",
-                "never sensed": f"{total['never_share']:.0%}",
-                "last sensed, median, s ago": f"{total['median_unsensed_s']:.1f}",
-            }
+        per_episode = parts.set_index("thing")["per_episode"]
+        total = {str(name): value for name, value in parts[parts["thing"] == ALL].iloc[0].items()}
+        row = {"condition": condition, "collisions an episode": f"{per_episode[ALL]:.2f}"}
+        row |= {name: f"{per_episode.get(thing, 0.0):.2f}" for thing, name in THINGS.items()}
+        row |= {
+            "outside the sensor's sectors": _unless_missing(total["outside_share"], "{:.0%}"),
+            "never sensed": _unless_missing(total["never_share"], "{:.0%}"),
+            "last sensed, median": _unless_missing(total["median_unsensed_s"], "{:.2f} s before"),
+            "bearing to either side, median": _unless_missing(np.degrees(total["median_abs_bearing_rad"]), "{:.0f}°"),
+        }
         rows.append(row)
-    return pd.DataFrame(rows).fillna("")
+    return pd.DataFrame(rows)
+
+
+def _unless_missing(value: float, form: str) -> str:
+    return "" if pd.isna(value) else form.format(value)
 
 
 def write_collisions(folder: Path) -> str:

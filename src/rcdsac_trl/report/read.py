@@ -18,6 +18,7 @@ DESCRIPTION = "evaluation.json"
 COLLISIONS = "collisions.csv"
 CONDITION = ("agent", "sensor", "beta", "collision_weight", "beta_controller")
 """Columns that say what drove an episode."""
+_OF_A_COLLISION = ("thing", "bearing_rad", "bearing_sensed", "unsensed_s")
 _EPISODE = ("train_seed", "map", "episode")
 # What must be equal for agents to have met the same maps, starts, goals and movers, under the same rules.
 _PROTOCOL = ("split", "seed", "num_maps", "num_episodes", "sampled", "map", "task")
@@ -108,7 +109,7 @@ def read_evaluation(folder: Path) -> Evaluation:
         missing |= {"beta", "collision_weight", "map", "episode", "collisions", "reward"} - set(episodes)
         collisions = pd.read_csv(folder / COLLISIONS) if (folder / COLLISIONS).exists() else None
         if collisions is not None:
-            missing |= {"beta", "collision_weight", "thing", "bearing_sensed", "unsensed_s"} - set(collisions)
+            missing |= {"beta", "collision_weight", *_OF_A_COLLISION} - set(collisions)
     except (OSError, ValueError, TypeError) as error:
         raise UserInputError(f"{folder} cannot be read ({error}): evaluate again into another folder") from error
     if missing:
@@ -209,7 +210,7 @@ def _collisions(evaluations: Sequence[Evaluation]) -> pd.DataFrame:
         if evaluation.collisions is not None and len(evaluation.collisions)
     ]
     if not tables:
-        return pd.DataFrame(columns=[*CONDITION, "thing", "bearing_sensed", "unsensed_s"])
+        return pd.DataFrame(columns=[*CONDITION, *_OF_A_COLLISION])
     # Names are text also where no controller's agent collided.
     return pd.concat([table.astype({"beta_controller": object}) for table in tables], ignore_index=True)
 
