@@ -2,7 +2,11 @@
 
 from rcdsac_trl.cli import Command
 
-main = Command("evaluate", "rcdsac_trl.evaluation.evaluation:make_evaluation")
+main = Command(
+    "evaluate",
+    "rcdsac_trl.evaluation.evaluation:make_evaluation",
+    describe="rcdsac_trl.report.collision_report:write_collisions",
+)
 
 if __name__ == "__main__":
     main()

@@ -401,7 +401,7 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
     assert "collisions_mean" in out
     assert out.endswith("written to there\n")
     assert [path.name for path in cwd.iterdir()] == ["there"]
-    for name in ("episodes.csv", "summary.csv", "evaluation.json"):
+    for name in ("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json"):
         assert (cwd / "there" / name).read_bytes() == (here / name).read_bytes()
 
 

@@ -143,7 +143,7 @@ def test_every_controller_meets_every_episode(out: Path) -> None:
 
 def test_processes_do_not_change_what_controllers_do(run: Path, out: Path, tmp_path: Path) -> None:
     again = evaluate(f"run={run}", *ALL, f"out={tmp_path}", "num_workers=2")
-    for name in ("episodes.csv", "summary.csv", "evaluation.json"):
+    for name in ("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json"):
         assert (again / name).read_bytes() == (out / name).read_bytes()
 
 

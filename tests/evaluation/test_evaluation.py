@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -34,11 +34,12 @@ from rcdsac_trl.rollout.worker import EpisodeBatch, RolloutWorker
 from rcdsac_trl.storage.checkpoint import Checkpoints, load_weights
 from rcdsac_trl.storage.checkpoint_record import Progress, load_progress
 from rcdsac_trl.training.validation import Snapshot
+from rcdsac_trl.world.maps.shapes import Kind
 from rcdsac_trl.world.task.env import make_env
 from rcdsac_trl.world.task.world_settings import WorldSettings
 from tiny import evaluate, tiny_settings, tiny_trainer
 
-FILES = ("episodes.csv", "summary.csv", "evaluation.json")
+FILES = ("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -181,6 +182,30 @@ def test_rows_and_summary_add_up(run: Path, tmp_path: Path) -> None:
             spread = (sum((value - mean) ** 2 for value in values) / 6) ** 0.5
             assert line[f"{metric}_mean"] == pytest.approx(mean, rel=1e-4, abs=1e-6)
             assert line[f"{metric}_std"] == pytest.approx(spread, rel=1e-3, abs=1e-5)
+
+
+def test_every_collision_has_a_row(tmp_path: Path) -> None:
+    """As many as the episodes count, and each at a step whose own contact begins there: blind driving hits a lot."""
+    blind = [
+        "map=mixed",
+        "task=default",
+        "map.num_movers=6",
+        "map.size_m=10",
+        "task.episode_steps=300",
+        "num_episodes=8",
+    ]
+    out = evaluate("baseline=pursuit", *blind, f"out={tmp_path / 'out'}")
+    episodes, collisions = pd.read_csv(out / "episodes.csv"), pd.read_csv(out / "collisions.csv")
+    counted = collisions.groupby("episode").size().reindex(episodes["episode"], fill_value=0)
+    assert counted.tolist() == episodes["collisions"].tolist()
+    assert len(collisions) > 3
+    assert list(collisions)[:4] == ["beta", "collision_weight", "map", "episode"]
+    assert set(collisions["thing"]) <= {*get_args(Kind), "mover"}
+    reach = np.hypot(collisions["x_m"] - collisions["robot_x_m"], collisions["y_m"] - collisions["robot_y_m"])
+    assert reach.between(0.25 * np.cos(np.pi / 8) - 0.005, 0.255).all()
+    assert (collisions["unsensed_s"].dropna() <= collisions["time_s"].loc[collisions["unsensed_s"].notna()]).all()
+    stands = collisions["thing"] != "mover"
+    assert (collisions.loc[stands, ["thing_vx_m_per_s", "thing_vy_m_per_s"]] == 0.0).all(axis=None)
 
 
 class Hits:

@@ -178,7 +178,7 @@ def test_an_evaluation_films_what_it_measured(run: Path, tmp_path: Path, monkeyp
         f"run={run}", "beta=[-2,-1]", "num_maps=2", f"out={tmp_path}", "record=true", "video.map=1", "video.episode=1"
     )
     assert {path.name for path in out.iterdir()} == {
-        *("episodes.csv", "summary.csv", "evaluation.json"),
+        *("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json"),
         *("video-map1-episode1.mp4", "video-map1-episode1.gif", "ways-map1-episode1.png"),
     }
     number, height, width, _ = frames_of(out / "video-map1-episode1.mp4").shape

@@ -4,6 +4,7 @@ import json
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pandas as pd
@@ -11,11 +12,12 @@ import pytest
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import __main__ as command
-from rcdsac_trl.report import findings, statistics, table
-from rcdsac_trl.report.figures import learning_curves
+from rcdsac_trl.report import collision_report, findings, statistics, table
+from rcdsac_trl.report.figures import collision_causes, learning_curves
 from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.write import write_report
+from rcdsac_trl.world.maps.shapes import Kind
 
 MAPS, EPISODES = 6, 3
 PROTOCOL = {
@@ -253,6 +255,103 @@ def test_controllers_are_compared_with_the_best_fixed_beta(tmp_path: Path) -> No
     assert len(pd.read_csv(tmp_path / "out" / "adaptive.csv")) == 4
 
 
+# ------------------------------------------------------------------------------------------------ collisions
+def with_collisions(folder: Path, rows: list[tuple[float, str, int, float]]) -> Path:
+    """Add collisions to an evaluation: beta, thing, whether the bearing is sensed, and since when it was not."""
+    names = ["beta", "thing", "bearing_sensed", "unsensed_s"]
+    table = pd.DataFrame(rows, columns=names).assign(collision_weight=np.nan, map=0, episode=0, bearing_rad=-1.0)
+    table.to_csv(folder / "collisions.csv", index=False)
+    return folder
+
+
+def test_collisions_are_summed_up_by_hand(tmp_path: Path) -> None:
+    hit = [(-2.0, "mover", 0, 0.2), (-2.0, "mover", 0, 0.6), (-2.0, "mover", 1, NONE), (-2.0, "outer_wall", 0, 1.0)]
+    new = with_collisions(evaluate(tmp_path / "a", "rcdsac_pow", {-2.0: 0, -1.0: 1}), hit)
+    untouched = with_collisions(evaluate(tmp_path / "b", "sac", {NONE: 0}), [])
+    old = evaluate(tmp_path / "c", "pursuit", {NONE: 3})
+    episodes = read_episodes([new, untouched, old])
+    assert "diagnosed" not in episodes.metrics
+    summary = collision_report.of_episodes(episodes, findings.labels(episodes))
+    averse, bold, sac = "RC-DSAC (resample) pow β = -2", "RC-DSAC (resample) pow β = -1", "SAC"
+    # The old evaluation does not say what was hit: it is missing, not at 0.
+    assert summary[["condition", "thing", "collisions"]].to_numpy().tolist() == [
+        [averse, "all", 4],
+        [averse, "outer_wall", 1],
+        [averse, "mover", 3],
+        [bold, "all", 0],
+        [sac, "all", 0],
+    ]
+    found = summary.set_index(["condition", "thing"])
+    movers = found.loc[(averse, "mover")]
+    assert movers["per_episode"] == 3 / (MAPS * EPISODES)
+    assert movers[["share", "outside_share", "never_share"]].tolist() == pytest.approx([3 / 4, 2 / 3, 1 / 3])
+    assert (movers["median_unsensed_s"], movers["median_abs_bearing_rad"]) == pytest.approx((0.4, 1.0))
+    assert found.loc[(averse, "all"), "median_unsensed_s"] == 0.6
+    assert found.loc[(bold, "all"), ["per_episode", "share"]].isna().tolist() == [False, True]
+    wide = collision_report.wide(summary).set_index("condition")
+    assert wide.loc[averse].tolist() == [
+        "0.22",
+        "0.06",
+        "0.00",
+        "0.00",
+        "0.00",
+        "0.17",
+        "75%",
+        "25%",
+        "0.60 s before",
+        "57°",
+    ]
+    assert wide.loc[sac].tolist() == ["0.00"] * 6 + [""] * 4
+
+
+def test_the_bars_add_up_to_the_collisions_of_an_episode(tmp_path: Path) -> None:
+    hit = [(-2.0, "mover", 0, 0.2), (-2.0, "mover", 1, 0.2), (-2.0, "inner_wall", 0, 0.2)]
+    episodes = read_episodes([with_collisions(evaluate(tmp_path / "a", "rcdsac_pow", {-2.0: 0, -1.0: 1}), hit)])
+    figure = collision_causes(collision_report.of_episodes(episodes, findings.labels(episodes)))
+    bars = [bar for bar in figure.axes[0].patches if bar.get_width() > 0]
+    assert [bar.get_width() * MAPS * EPISODES for bar in bars] == pytest.approx([1, 1, 1])
+    assert [bool(bar.get_hatch()) for bar in bars] == [True, False, True]
+    assert bars[-1].get_x() + bars[-1].get_width() == pytest.approx(3 / (MAPS * EPISODES))
+    assert [text.get_text() for text in figure.axes[0].texts] == ["0.17", "0.00"]
+
+
+def test_controllers_collide_under_their_names(tmp_path: Path) -> None:
+    """Also where only the fixed betas of another evaluation, or none of the controllers, did."""
+    turned = with_controllers(tmp_path / "a", "rcdsac_pow", {-2.0: 2}, {"clearance": 0, "tail_variance": 1})
+    with_collisions(turned, [(-2.0, "mover", 0, 0.2), (NONE, "mover", 0, 0.2)])
+    collisions = pd.read_csv(turned / "collisions.csv").assign(beta_controller=[None, "clearance"])
+    collisions.to_csv(turned / "collisions.csv", index=False)
+    fixed = with_collisions(evaluate(tmp_path / "b", "rcdsac_cvar", {0.5: 1}), [(0.5, "outer_wall", 0, 1.0)])
+    quiet = with_controllers(tmp_path / "c", "dsac_pow", {-2.0: 2}, {"clearance": 0})
+    with_collisions(quiet, [(-2.0, "mover", 0, 0.2)])
+    pd.read_csv(quiet / "collisions.csv").assign(beta_controller=None).to_csv(quiet / "collisions.csv", index=False)
+    episodes = read_episodes([turned, fixed, quiet])
+    summary = collision_report.of_episodes(episodes, findings.labels(episodes))
+    counted = summary[summary["thing"] == "all"].set_index(["agent", "beta_controller"])["collisions"]
+    assert counted["rcdsac_pow", "clearance"] == 1
+    assert counted["rcdsac_pow", "tail_variance"] == counted["dsac_pow", "clearance"] == 0
+    assert summary[summary["thing"] == "all"]["collisions"].sum() == 4
+
+
+def test_an_evaluation_is_told_what_was_hit(tmp_path: Path) -> None:
+    folder = with_collisions(evaluate(tmp_path / "a", "rcdsac_pow", {-2.0: 0, -1.0: 1}), [(-1.0, "mover", 0, 0.2)])
+    text = collision_report.write_collisions(folder)
+    summary = pd.read_csv(folder / "collision_summary.csv")
+    assert summary[["beta", "thing", "collisions"]].to_numpy().tolist() == [
+        [-2, "all", 0],
+        [-1, "all", 1],
+        [-1, "mover", 1],
+    ]
+    assert len(text.splitlines()) == 1 + len(summary)
+    (folder / "collisions.csv").write_text("beta,collision_weight,map,episode,thing\n")
+    with pytest.raises(UserInputError, match="does not say bearing_rad, bearing_sensed, unsensed_s"):
+        read_episodes([folder])
+
+
+def test_things_are_those_of_the_world() -> None:
+    assert list(collision_report.THINGS) == [*get_args(Kind), "mover"]
+
+
 class Images(HTMLParser):
     """Counts what a page shows and what it would fetch."""
 
@@ -279,24 +378,27 @@ def run_folder(path: Path) -> Path:
 
 
 def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
-    folders = [run_folder(tmp_path / "run"), evaluate(tmp_path / "sac", "sac", {NONE: 3})]
+    run = run_folder(tmp_path / "run")
+    with_collisions(run / "evaluation" / "best", [(-2.0, "mover", 0, 0.2)])
+    folders = [run, evaluate(tmp_path / "sac", "sac", {NONE: 3})]
     out = tmp_path / "out"
     write_report(read_episodes(folders), folders, out)
     assert {path.name for path in out.iterdir()} == {
         *(f"table.{suffix}" for suffix in ("md", "csv", "tex", "html")),
-        *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "averages")),
+        *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "averages", "collision_summary")),
         *(
             f"{name}.png"
             for name in ("beta_response_pow", "differences_collisions_narrow", "differences_reward_narrow")
         ),
         "learning_curves.png",
+        "collision_causes.png",
         "report.html",
     }
     page = Images()
     page.feed((out / "report.html").read_text())
-    assert len(page.sources) == 4
+    assert len(page.sources) == 5
     assert all(source.startswith("data:image/png;base64,") for source in page.sources)
-    assert page.tables == 5
+    assert page.tables == 6
 
 
 def test_the_command_refuses_before_it_writes(

@@ -166,6 +166,19 @@ def test_clutter_density() -> None:
         assert 0.8 * expected <= clutter <= expected
 
 
+def test_kinds_of_what_stands() -> None:
+    """Every layout has four outer walls; the others are inner ones, and clutter is no wall."""
+    for layout in ("rooms", "clutter", "mixed"):
+        map_ = generate_map(MapSettings(layouts=(layout,), mapped_fraction=0.5), "train", 0, 0)
+        kinds = [map_.kind(piece) for piece in (*map_.boxes, *map_.cylinders)]
+        assert kinds[:4] == ["outer_wall"] * 4
+        assert kinds.count("outer_wall") == 4
+        assert kinds.count("inner_wall") == sum(box.wall for box in map_.boxes) - 4 > 0
+        clutter = [piece for piece in (*map_.boxes, *map_.cylinders) if not getattr(piece, "wall", False)]
+        assert kinds.count("mapped_clutter") == sum(piece.mapped for piece in clutter) > 0
+        assert kinds.count("unmapped_clutter") == sum(not piece.mapped for piece in clutter) > 0
+
+
 def test_all_layouts_are_drawn() -> None:
     drawn = {generate_map(MapSettings(clutter_per_m2=0.0), "train", 0, index).layout for index in range(20)}
     assert drawn == set(LAYOUTS)

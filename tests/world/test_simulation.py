@@ -118,6 +118,24 @@ def test_wall_stops_the_robot(simulation):
     assert abs(result.v_c) < 1e-3
 
 
+def test_a_touch_by_hand(simulation):
+    load(simulation, room(), (6.0, 4.0, 0.0))
+    for _ in range(22):
+        simulation.step(0.6, 0.0, 7)
+        assert simulation.touch is None
+    simulation.step(0.6, 0.0, 7)
+    touch = simulation.touch
+    # The 20 motor steps of speeding up end at 0.126 m, so 1.643 m are left, which 136 steps of 0.012 m and a last one
+    # of 0.011 m take; it drove at full speed in that one, too. The step after it, 157 from 0, finds the contact.
+    assert touch.motor_step == 157 - 22 * 7
+    assert touch.pose == pytest.approx((8.0 - APOTHEM_M, 4.0, 0.0), abs=1e-3)
+    assert (touch.v, touch.omega, touch.mover) == (pytest.approx(0.6, abs=1e-12), 0.0, None)
+    assert touch.x == pytest.approx(8.0, abs=1e-9)
+    assert abs(touch.y - 4.0) <= 0.25 * math.sin(math.pi / 8.0) + 1e-9  # on the flat side
+    load(simulation, room(), (6.0, 4.0, 0.0))
+    assert simulation.touch is None
+
+
 def onsets(simulation, commands, motor_steps=7):
     """Drive; return in how many steps a contact began, and whether the last step was in contact."""
     touching, begun = False, 0
@@ -359,8 +377,14 @@ def test_driving_into_a_waiting_mover_is_a_contact(simulation):
             break
     assert gap < STOP_GAP_M + 0.02
     side = math.copysign(1.0, simulation.mover_positions[0][0] - 4.0)
-    results = [simulation.step(0.6 if side > 0 else -0.2, 0.0, 7) for _ in range(12)]
-    assert any(result.in_contact for result in results)
+    for _ in range(12):
+        if simulation.step(0.6 if side > 0 else -0.2, 0.0, 7).in_contact:
+            break
+    touch = simulation.touch
+    assert touch.mover == 0
+    assert math.hypot(*(simulation.mover_positions[0] - (touch.x, touch.y))) == pytest.approx(0.3, abs=1e-5)
+    assert touch.v == pytest.approx(0.6 if side > 0 else -0.2, abs=0.3)
+    assert math.copysign(1.0, touch.v) == side
 
 
 def test_map_without_movers(simulation):

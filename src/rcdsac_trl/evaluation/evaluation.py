@@ -18,6 +18,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
+from rcdsac_trl.rollout.collisions import COLLISIONS, collision_table
 from rcdsac_trl.rollout.evaluation_pool import Rows, evaluate_maps
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, packed, packed_loss
 from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
@@ -36,7 +37,7 @@ from rcdsac_trl.world.task.world_settings import WorldSettings
 def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     """Make an evaluation of a run or a baseline; refuses before anything is written.
 
-    It writes ``episodes.csv``, ``summary.csv``, ``evaluation.json`` and, if asked for, films.
+    It writes ``episodes.csv``, ``summary.csv``, ``collisions.csv``, ``evaluation.json`` and, if asked for, films.
 
     Raises:
         UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit, a
@@ -96,7 +97,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings) -> Evaluation
         sampled=settings.sampled,
         device=runtime.resolve_device(settings.device),
         threads=1 if settings.threads == "auto" else settings.threads,
-        trips=True,
+        detailed=True,
         controller=settings.controller if controllers else None,
         baseline=settings.baseline or PURSUIT,
     )
@@ -141,13 +142,15 @@ def _described(settings: EvaluationSettings, spec: EvaluationSpec) -> dict[str, 
 
 
 def _findings(rows: Rows) -> Findings:
-    episodes = table_of([rows])
+    measured = table_of([rows])
+    collisions, episodes = collision_table(measured), measured.drop(columns=COLLISIONS)
     summary = summarise(episodes, [key for key in CONDITION_COLUMNS if key in episodes])
     shown = summary.dropna(axis="columns", how="all").set_index("episodes")
     return Findings(
         {
             "episodes.csv": episodes.to_csv(index=False, float_format="%.9g"),
             "summary.csv": summary.to_csv(index=False, float_format="%.6g"),
+            "collisions.csv": collisions.to_csv(index=False, float_format="%.6g"),
         },
         text=shown.T.to_string(header=True, float_format="{:.3f}".format, na_rep=""),
     )

@@ -20,7 +20,7 @@ from rcdsac_trl.system.resources import check_writable
 
 # What stays of a run, where it has it: enough for every table and figure of a report.
 _TABLES = ("config.yaml", "training_episodes.csv", "validation_episodes.csv", "csv/scalars/time/elapsed_s.csv")
-_EVALUATION = ("evaluation.json", "episodes.csv")
+_EVALUATION = ("evaluation.json", "episodes.csv", "collisions.csv")
 # Steps over which half precision is compared with single.
 _STEPS = 200
 

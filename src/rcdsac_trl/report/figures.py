@@ -6,9 +6,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from rcdsac_trl.report import statistics
+from rcdsac_trl.report.collision_report import THINGS
 from rcdsac_trl.report.findings import TAILS, bounded, labels
 from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.statistics import Statistic
@@ -22,6 +24,14 @@ _RESPONSES: dict[str, tuple[str, Statistic]] = {
     f"reward: all (dashed) and the worst {TAILS[0]:.0%}": ("reward", statistics.cvar(TAILS[0])),
 }
 _LEARNT = ("reward", "collisions")
+_THING_COLORS = {
+    "outer_wall": "#3d4450",
+    "inner_wall": "#737d8f",
+    "mapped_clutter": "#aab4c4",
+    "unmapped_clutter": "#e9b872",
+    "mover": "#8a3fa0",
+}
+_OUTSIDE = "////"  # hatching
 
 
 def beta_response(episodes: Episodes, measure: str) -> Figure | None:
@@ -97,6 +107,38 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
     axes.axvline(0, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
     axes.set_yticks(range(len(others)), [names[i] for i in others])
     axes.invert_yaxis()
+    return figure
+
+
+def collision_causes(summary: pd.DataFrame) -> Figure:
+    """Draw how many collisions an episode had with what, a bar a condition; hatched: outside the sensor's sectors.
+
+    Args:
+        summary: from :func:`rcdsac_trl.report.collision_report.of_episodes`.
+    """
+    names = summary["condition"].drop_duplicates().tolist()
+    figure = Figure(figsize=(11.0, 1.9 + 0.42 * len(names)), layout="constrained")
+    axes = figure.subplots()
+    for row, name in enumerate(names):
+        parts = summary[summary["condition"] == name].set_index("thing")
+        left = 0.0
+        for thing in (thing for thing in THINGS if thing in parts.index):
+            outside = parts.at[thing, "per_episode"] * parts.at[thing, "outside_share"]
+            for width, hatch in ((parts.at[thing, "per_episode"] - outside, ""), (outside, _OUTSIDE)):
+                axes.barh(
+                    row, width, 0.7, left, color=_THING_COLORS[thing], hatch=hatch, edgecolor="white", linewidth=0
+                )
+                left += width
+        axes.annotate(f"{left:.2f}", (left, row), xytext=(5, 0), textcoords="offset points", va="center", color=INK)
+    style(axes, "What was hit", "collisions an episode")
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(visible=False, axis="y")
+    axes.set_xlim(left=0)
+    axes.margins(x=0.08)
+    axes.invert_yaxis()
+    handles = [Patch(color=_THING_COLORS[thing], label=name) for thing, name in THINGS.items()]
+    handles.append(Patch(facecolor=FAINT, hatch=_OUTSIDE, edgecolor="white", label="outside the sensor's sectors"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
 

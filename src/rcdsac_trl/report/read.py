@@ -15,8 +15,10 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.statistics import Array
 
 DESCRIPTION = "evaluation.json"
+COLLISIONS = "collisions.csv"
 CONDITION = ("agent", "sensor", "beta", "collision_weight", "beta_controller")
 """Columns that say what drove an episode."""
+_OF_A_COLLISION = ("thing", "bearing_rad", "bearing_sensed", "unsensed_s")
 _EPISODE = ("train_seed", "map", "episode")
 # What must be equal for agents to have met the same maps, starts, goals and movers, under the same rules.
 _PROTOCOL = ("split", "seed", "num_maps", "num_episodes", "sampled", "map", "task")
@@ -61,11 +63,13 @@ class Evaluation:
         folder: where it lies.
         described: ``evaluation.json``.
         episodes: ``episodes.csv``.
+        collisions: ``collisions.csv``; None in folders of versions that wrote none.
     """
 
     folder: Path
     described: dict[str, Any]
     episodes: pd.DataFrame
+    collisions: pd.DataFrame | None = None
 
     @property
     def protocol(self) -> dict[str, Any]:
@@ -103,13 +107,32 @@ def read_evaluation(folder: Path) -> Evaluation:
         episodes = pd.read_csv(folder / "episodes.csv")
         missing = {*_PROTOCOL, "agent", "sensor"} - set(described)
         missing |= {"beta", "collision_weight", "map", "episode", "collisions", "reward"} - set(episodes)
+        collisions = pd.read_csv(folder / COLLISIONS) if (folder / COLLISIONS).exists() else None
+        if collisions is not None:
+            missing |= {"beta", "collision_weight", *_OF_A_COLLISION} - set(collisions)
     except (OSError, ValueError, TypeError) as error:
         raise UserInputError(f"{folder} cannot be read ({error}): evaluate again into another folder") from error
     if missing:
         raise UserInputError(f"{folder} does not say {', '.join(sorted(missing))}: evaluate again with this version")
     if "beta_controller" not in episodes:  # nothing turned beta
         episodes = episodes.assign(beta_controller=None, mean_beta=episodes["beta"])
-    return Evaluation(folder, described, episodes)
+    if collisions is not None and "beta_controller" not in collisions:
+        collisions = collisions.assign(beta_controller=None)
+    return Evaluation(folder, described, episodes, collisions)
+
+
+def under(rows: pd.DataFrame, condition: pd.Series, by: Sequence[str]) -> pd.DataFrame:
+    """Return the rows of a condition.
+
+    Args:
+        rows: with the columns of `by`.
+        condition: values of these columns; missing ones match missing ones.
+        by: columns that tell conditions apart.
+    """
+    for key in by:
+        value = condition[key]
+        rows = rows[rows[key].isna() if pd.isna(value) else rows[key] == value]
+    return rows
 
 
 @dataclass(frozen=True)
@@ -117,13 +140,15 @@ class Episodes:
     """The episodes of several evaluations on the same maps.
 
     Attributes:
-        table: one row an episode: :data:`CONDITION`, `mean_beta`, `train_seed`, `map`, `episode` and the metrics that
-            all have.
+        table: one row an episode: :data:`CONDITION`, `mean_beta`, `train_seed`, `map`, `episode`, the metrics that
+            all have, and `diagnosed`: whether its collisions are among `collisions`.
         protocol: of all evaluations.
+        collisions: one row a collision, of the evaluations that wrote ``collisions.csv``, with :data:`CONDITION`.
     """
 
     table: pd.DataFrame
     protocol: dict[str, Any]
+    collisions: pd.DataFrame
 
     @cached_property
     def metrics(self) -> list[str]:
@@ -141,11 +166,7 @@ class Episodes:
 
     def of(self, condition: pd.Series, metric: str) -> Array:
         """Return a metric under a condition: ``[training seeds, maps, episodes]``."""
-        rows = self.table
-        for key in CONDITION:
-            value = condition[key]
-            rows = rows[rows[key].isna() if pd.isna(value) else rows[key] == value]
-        ordered = rows.sort_values(list(_EPISODE))
+        ordered = under(self.table, condition, CONDITION).sort_values(list(_EPISODE))
         shape = (-1, self.protocol["num_maps"], self.protocol["num_episodes"])
         return ordered[metric].to_numpy(np.float64).reshape(shape)
 
@@ -170,6 +191,7 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
             measure=evaluation.described.get("measure"),
             train_seed=evaluation.described.get("train_seed") or 0,
             folder=str(evaluation.folder),
+            diagnosed=evaluation.collisions is not None,
         )
         for evaluation in evaluations
     ]
@@ -177,7 +199,20 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
     table = pd.concat([part[[column for column in part if column in shared]] for part in tables], ignore_index=True)
     _check_complete(table, evaluations[0].protocol)
     table = table.drop(columns="folder").assign(collision_free=(table["collisions"] == 0).astype(float))
-    return Episodes(table, evaluations[0].protocol)
+    return Episodes(table, evaluations[0].protocol, _collisions(evaluations))
+
+
+def _collisions(evaluations: Sequence[Evaluation]) -> pd.DataFrame:
+    """Put the collisions of all evaluations that say something of them into one table."""
+    tables = [
+        evaluation.collisions.assign(agent=evaluation.described["agent"], sensor=evaluation.described["sensor"])
+        for evaluation in evaluations
+        if evaluation.collisions is not None and len(evaluation.collisions)
+    ]
+    if not tables:
+        return pd.DataFrame(columns=[*CONDITION, *_OF_A_COLLISION])
+    # Names are text also where no controller's agent collided.
+    return pd.concat([table.astype({"beta_controller": object}) for table in tables], ignore_index=True)
 
 
 def _check_same_maps(evaluations: Sequence[Evaluation]) -> None:

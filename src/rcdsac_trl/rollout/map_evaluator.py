@@ -17,7 +17,9 @@ from rcdsac_trl.config.evaluation_settings import ControllerSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
+from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.beta_control import AdaptivePolicy
+from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
 from rcdsac_trl.rollout.environments import evaluation_worker
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, unpacked_loss
@@ -53,7 +55,7 @@ class EvaluationSpec:
         sampled: draw actions instead of taking tanh(mean).
         device: where the policy acts.
         threads: that torch uses for one operation while it drives.
-        trips: measure the ways driven, too.
+        detailed: measure the ways driven and say of each collision what was hit, too.
         controller: settings of controllers, which then tell all agents beta; None: nothing turns it.
         baseline: what drives where there is no actor.
     """
@@ -67,7 +69,7 @@ class EvaluationSpec:
     sampled: bool
     device: str
     threads: int
-    trips: bool = False
+    detailed: bool = False
     controller: ControllerSettings | None = None
     baseline: str = PURSUIT
 
@@ -109,7 +111,7 @@ def map_evaluator(
     else:
         policy = _policy(spec, actor, noise)
     planner = policy if isinstance(policy, ControllerPolicy) else None
-    more: list[Measure] = [partial(_trips, spec)] if spec.trips else []
+    more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
     if spec.controller is not None:
         policy = adaptive = _adaptive(spec, spec.controller, policy, loss)
         more.append(lambda *_: {"mean_beta": adaptive.mean_betas()})
@@ -134,7 +136,7 @@ def map_evaluator(
         )
 
     try:
-        yield drive
+        yield partial(_with_collisions, spec, worker, drive) if spec.detailed else drive
     finally:
         worker.close()
         torch.set_num_threads(threads)
@@ -142,6 +144,24 @@ def map_evaluator(
 
 def _all(measures: Sequence[Measure], map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:
     return {name: value for measure in measures for name, value in measure(map_index, episodes).items()}
+
+
+def _with_collisions(
+    spec: EvaluationSpec, worker: RolloutWorker, drive: Drive, map_index: int, before_step: Callable[[], None]
+) -> Rows:
+    """Drive a map, and put the collisions of each episode into its row."""
+    recorder = CollisionRecorder(worker.env.agents)
+
+    def noted() -> None:
+        before_step()
+        recorder.note()
+
+    rows = drive(map_index, noted)
+    recorder.note()  # what the last step led to
+    map_, _ = load_map(spec.world.map_settings, spec.split, spec.seed, map_index)
+    mask = sensor_mask(spec.world.sensor)
+    found = recorder.collisions(map_, mask, _periods_s(spec, map_index).tolist())
+    return [row | {COLLISIONS: collisions} for row, collisions in zip(rows, found, strict=True)]
 
 
 def _adaptive(
@@ -170,12 +190,15 @@ def _adaptive(
 
 def _trips(spec: EvaluationSpec, map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:
     """Measure the ways of the episodes on a map."""
-    task = spec.world.task
     _, planner = load_map(spec.world.map_settings, spec.split, spec.seed, map_index)
+    return navigation_metrics(episodes, planner, _periods_s(spec, map_index))
+
+
+def _periods_s(spec: EvaluationSpec, map_index: int) -> Tensor:
+    """Return the length of an agent step in each episode on a map, ``[N]``, s."""
     agents = range(spec.num_episodes)
-    steps = [draw_motor_steps(task, spec.split, spec.seed, map_index, agent) for agent in agents]
-    period_s = MOTOR_PERIOD_S * torch.tensor(steps * len(spec.conditions), dtype=torch.float64, device="cpu")
-    return navigation_metrics(episodes, planner, period_s)
+    steps = [draw_motor_steps(spec.world.task, spec.split, spec.seed, map_index, agent) for agent in agents]
+    return MOTOR_PERIOD_S * torch.tensor(steps * len(spec.conditions), dtype=torch.float64, device="cpu")
 
 
 def _policy(spec: EvaluationSpec, actor: bytes, noise: AgentNoise) -> TensorDictModuleBase:

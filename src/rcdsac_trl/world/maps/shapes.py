@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +89,13 @@ class Mover:
     speed_m_per_s: float
 
 
+Kind = Literal["outer_wall", "inner_wall", "mapped_clutter", "unmapped_clutter"]
+"""What something that stands is; see :meth:`Map.kind`."""
+
+# How near to the map's border a wall must reach to be an outer one.
+_BORDER_M = 1e-6
+
+
 @dataclass(frozen=True)
 class Map:
     """One map, as a plain value.
@@ -145,6 +152,23 @@ class Map:
         """
         pieces: list[Box | Cylinder] = [*self.boxes, *self.cylinders]
         return solid_arrays([piece for piece in pieces if piece.mapped or not mapped_only])
+
+    def kind(self, piece: Box | Cylinder) -> Kind:
+        """Say what something that stands is. An outer wall is one that reaches the map's border.
+
+        Args:
+            piece: of this map.
+
+        Example:
+            >>> wall = Box(x=10.0, y=0.1, half_x=10.0, half_y=0.1, yaw=0.0, mapped=True, wall=True)
+            >>> Map(layout="clutter", size_m=20.0, boxes=(wall,), cylinders=(), movers=()).kind(wall)
+            'outer_wall'
+        """
+        if isinstance(piece, Box) and piece.wall:
+            corners = piece.corners()
+            inside = corners.min() > _BORDER_M and corners.max() < self.size_m - _BORDER_M
+            return "inner_wall" if inside else "outer_wall"
+        return "mapped_clutter" if piece.mapped else "unmapped_clutter"
 
     def to_json(self) -> str:
         """Return the map as JSON; :meth:`from_json` gives an equal map back, bit for bit."""

@@ -8,7 +8,8 @@ velocity away, and what is left is what the robot measures.
 
 import math
 import time
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,28 @@ class StepResult(NamedTuple):
     in_contact: bool
 
 
+class Touch(NamedTuple):
+    """How the robot touched something first in an agent step, as it stood when that was noticed.
+
+    Attributes:
+        x: where on the thing, map frame, m.
+        y: likewise.
+        mover: number of the mover that was touched; None: something that stands.
+        pose: the robot's x, y in m and yaw in rad.
+        v: linear velocity it drove with, before contact took any of it away, m/s.
+        omega: angular velocity likewise, rad/s.
+        motor_step: number of the motor step in the agent step, from 0.
+    """
+
+    x: float
+    y: float
+    mover: int | None
+    pose: tuple[float, float, float]
+    v: float
+    omega: float
+    motor_step: int
+
+
 class Simulation:
     """One robot in one PyBullet client, which is freed with it or when it is closed.
 
@@ -99,6 +122,8 @@ class Simulation:
             raise UserInputError("PyBullet could not open its window: gui=true needs a display; use gui=false")
         self._pose = (0.0, 0.0, 0.0)
         self._v_c = self._omega_c = 0.0
+        self._driven = (0.0, 0.0)  # velocities that the motor set last
+        self._touch: Touch | None = None
         self._clearance_m = 0.0
         self._in_contact = False
         self._apart_steps = 0  # motor steps without anything near, since the last touch
@@ -135,6 +160,8 @@ class Simulation:
         x, y, yaw = start_pose
         self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
         self._v_c = self._omega_c = self._clearance_m = 0.0
+        self._driven = (0.0, 0.0)
+        self._touch = None
         self._in_contact = False
         movers = self._movers = Movers(map, planner, start_pose[:2], movers_rng, MOTOR_PERIOD_S)
         self._mover_bodies = list(
@@ -163,6 +190,11 @@ class Simulation:
         """The movers' radii, float64 [k], m; a copy."""
         return self._movers.radii.copy()
 
+    @property
+    def touch(self) -> Touch | None:
+        """How the robot touched something first in the last step; None if it did not."""
+        return self._touch
+
     def step(self, v_u: float, omega_u: float, motor_steps: int) -> StepResult:
         """Hold one pair of desired velocities for a number of motor steps.
 
@@ -185,10 +217,12 @@ class Simulation:
         if unnoticed:
             movers.step(x, y, motor_steps - 1)
         # Contacts that cannot be are not asked for, nor the velocities that only contact would change.
-        touched = False
+        self._touch = None
         touchable = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
         self._clearance_m = 0.0  # not known until the next scan
+        v, omega = self._driven
         for motor_step in range(motor_steps):
+            before = x, y, yaw, v, omega
             if motor_step > 0 and not unnoticed:
                 gap_m = movers.step(x, y)
                 if gap_m < _MOVER_SYNC_GAP_M or self._gui:
@@ -205,15 +239,35 @@ class Simulation:
             cos, sin = math.cos(yaw), math.sin(yaw)
             v_c = linear[0] * cos + linear[1] * sin
             omega_c = angular[2]
-            if touchable and not touched:
+            if touchable and self._touch is None:
                 points = pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
-                touched = any(point[8] <= CONTACT_DISTANCE_M for point in points)
+                if any(point[8] <= CONTACT_DISTANCE_M for point in points):
+                    self._touch = self._touch_at(points, before, motor_step)
             if self._gui:
                 time.sleep(MOTOR_PERIOD_S)
         self._pose = (x, y, math.remainder(yaw, 2.0 * math.pi))
         self._v_c, self._omega_c = v_c, omega_c
-        self._follow_contact(touched, motor_steps)
+        self._driven = v, omega
+        self._follow_contact(self._touch is not None, motor_steps)
         return StepResult(self._pose, v_c, omega_c, self._in_contact)
+
+    def _touch_at(
+        self, points: Sequence[Sequence[Any]], before: tuple[float, float, float, float, float], motor_step: int
+    ) -> Touch:
+        """Describe the deepest of PyBullet's contact points.
+
+        Args:
+            points: as a motor step found them; it looks for contact first, and then moves the robot.
+            before: pose before that step, and velocities that the motor set in the step before it. In that one PyBullet
+                already slows down what would else go through a thing.
+            motor_step: its number.
+        """
+        deepest = min(points, key=lambda point: point[8])
+        movers = [body for body, _ in self._mover_bodies]
+        body, (x, y, _) = deepest[2], deepest[6]
+        x_robot, y_robot, yaw, v, omega = before
+        pose = x_robot, y_robot, math.remainder(yaw, 2.0 * math.pi)
+        return Touch(x, y, movers.index(body) if body in movers else None, pose, v, omega, motor_step)
 
     def _follow_contact(self, touched: bool, motor_steps: int) -> None:
         """Let a contact begin with a touch, and end when nothing has been near for long enough."""

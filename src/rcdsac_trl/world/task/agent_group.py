@@ -16,6 +16,7 @@ from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world.maps.generator import SPLITS, MapSettings, Split
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.sim.bullet import OfOneProcess
+from rcdsac_trl.world.sim.simulation import Simulation
 from rcdsac_trl.world.task import rules
 from rcdsac_trl.world.task.episode import NavigationAgent
 from rcdsac_trl.world.task.rules import TaskSettings
@@ -139,6 +140,10 @@ class AgentGroup(OfOneProcess):
     def scene(self, row: int) -> Scene:
         """Return what a picture of one agent shows."""
         return self._agents[row].scene()
+
+    def simulation(self, row: int) -> Simulation:
+        """Return the physics of one agent, to read from; a reset keeps it."""
+        return self._agents[row].simulation
 
     def close(self) -> None:
         """Disconnect all simulations."""

@@ -136,7 +136,7 @@ class NavigationAgent:
 
     def step(self, action: Sequence[float]) -> None:
         """Take one agent step."""
-        simulation, task = self._require_simulation(), self._task
+        simulation, task = self.simulation, self._task
         v_u, omega_u = desired_velocities(action)
         self._delayed.append((v_u, omega_u))
         moved = simulation.step(*self._delayed.popleft(), self._motor_steps)
@@ -162,9 +162,16 @@ class NavigationAgent:
         """The next waypoint and the one after it, m; on the last leg both are the goal."""
         return self._path[self._next], self._path[min(self._next + 1, len(self._path) - 1)]
 
+    @property
+    def simulation(self) -> Simulation:
+        """Its physics."""
+        if self._simulation is None:
+            raise UserInputError("the environment was stepped or drawn before its first reset; call reset() first")
+        return self._simulation
+
     def scene(self) -> Scene:
         """Return what a picture of this moment shows."""
-        simulation = self._require_simulation()
+        simulation = self.simulation
         return Scene(
             map=self._map,
             pose=self.pose,
@@ -181,11 +188,6 @@ class NavigationAgent:
         if self._simulation is not None:
             self._simulation.close()
             self._simulation = None
-
-    def _require_simulation(self) -> Simulation:
-        if self._simulation is None:
-            raise UserInputError("the environment was stepped or drawn before its first reset; call reset() first")
-        return self._simulation
 
     def _stream(self, purpose: str, *index: int) -> np.random.Generator:
         return stream(self._seed, f"{purpose}/{self._split}", self._episode, self._agent_id, *index)
@@ -221,7 +223,7 @@ class NavigationAgent:
     def _sense(self, elapsed_s: float) -> None:
         self._trail.append(self.pose[:2])
         task = self._task
-        distances = self._require_simulation().scan()
+        distances = self.simulation.scan()
         self.distances_m = rules.noisy_ranges(distances, task.range_noise_std_m, task.range_dropout, self._noise)
         v_c, omega_c, _, _ = self.velocities
         memory = self._memory
