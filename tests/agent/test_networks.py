@@ -55,7 +55,7 @@ NARROW = [*range(21), *range(158, 180)]
 
 
 def range_by_kernels(module: RangeFeatures, bins: Tensor) -> Tensor:
-    return observation_features(module.padded(bins), [], (module.conv_1, module.conv_2, module.linear), [])
+    return observation_features(module.read(bins), [], (module.conv_1, module.conv_2, module.linear), [])
 
 
 @pytest.mark.parametrize("number", [FEW_OBSERVATIONS, BLOCK, 2 * BLOCK + 3])

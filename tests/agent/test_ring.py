@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from rcdsac_trl.deploy.export.modules import ActorStep
 from rcdsac_trl.deploy.policy.inference import Encoders
 from rcdsac_trl.deploy.policy.policy import Policy
 from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, SHIPPED, Weights, packed, read_weights, shipped_names
+from rcdsac_trl.robot.observation import RangeCode, range_observation
 from rcdsac_trl.robot.range_sensor import SENSORS, sensor_mask
 from robots import full_size
 
@@ -55,7 +57,8 @@ def by_compiled_actor(weights: Weights, bins: Tensor) -> Tensor:
 
 
 def by_numpy(weights: Weights, bins: Tensor) -> Tensor:
-    encoders = Encoders([weights.part("actor.encoder")], sensor_mask(weights.config.sensor), weights.config.padding)
+    config = weights.config
+    encoders = Encoders([weights.part("actor.encoder")], sensor_mask(config.sensor), config.padding, config.range_code)
     nothing = np.zeros(10, np.float32), np.zeros((1, 128), np.float32)
     return torch.from_numpy(np.concatenate([encoders.step(row, *nothing) for row in bins.numpy()]))
 
@@ -88,26 +91,37 @@ def test_without_padding_the_last_three_bins_are_not_read(twin: Callable) -> Non
     assert effects[177:].max() < 1e-6
 
 
+@pytest.mark.parametrize("range_code", get_args(RangeCode))
 @pytest.mark.parametrize("padding", ["circular", "none"])
 @pytest.mark.parametrize("twin", TWINS[1:])
-def test_twins_agree_on_the_ring(twin: Callable, padding: str) -> None:
-    weights = full_size(sensor="full", padding=padding)
+def test_twins_agree_on_the_ring(twin: Callable, padding: str, range_code: str) -> None:
+    weights = full_size(sensor="full", padding=padding, range_code=range_code)
     bins = torch.rand(40, 180, generator=torch.Generator().manual_seed(1))
+    bins[bins < 0.3] = 0.0
     torch.testing.assert_close(twin(weights, bins), by_layers(weights, bins), rtol=1e-5, atol=2e-6)
+
+
+def test_nearness_is_0_where_nothing_is_and_at_3_m() -> None:
+    layers = encoder_of(full_size(sensor="full", range_code="nearness")).range
+    seen = np.full(180, np.inf)
+    seen[:3] = 2.9999, 0.3, 0.03
+    read = layers.read(torch.from_numpy(range_observation(seen, np.ones(180, bool)))[None])[0, 1:181]
+    torch.testing.assert_close(read[:3], torch.tensor([0.0, 1.0, 2.0]), rtol=0.0, atol=1e-4)
+    assert not read[3:].any()
 
 
 def test_turning_the_ring_shifts_the_positions() -> None:
     """By layers that pad each on its own, by ours, and by NumPy's."""
     weights = full_size(sensor="full")
     layers = encoder_of(weights).range
-    encoders = Encoders([weights.part("actor.encoder")], sensor_mask("full"), "circular")
+    encoders = Encoders([weights.part("actor.encoder")], sensor_mask("full"), "circular", "paper")
 
     def apart(bins: Tensor) -> Tensor:
         first = F.relu(layers.conv_1(F.pad(bins[None, None], (1, 2), mode="circular")))
         return F.relu(layers.conv_2(F.pad(first, (0, 1), mode="circular")))[0].T
 
     def ours(bins: Tensor) -> Tensor:
-        return F.relu(layers.conv_2(F.relu(layers.conv_1(layers.padded(bins[None]).unsqueeze(1)))))[0].T
+        return F.relu(layers.conv_2(F.relu(layers.conv_1(layers.read(bins[None]).unsqueeze(1)))))[0].T
 
     def numpys(bins: Tensor) -> Tensor:
         return torch.from_numpy(encoders._positions(bins.numpy())[0])
@@ -125,8 +139,8 @@ def test_each_position_reads_nine_bins_around_the_ring() -> None:
     for layer in (layers.conv_1, layers.conv_2):
         layer.weight.data.fill_(1.0)
     bins = torch.eye(180, dtype=torch.float64).unsqueeze(1)
-    positions = layers.conv_2(layers.conv_1(layers.padded(bins[:, 0]).unsqueeze(1)))
-    empty = layers.conv_2(layers.conv_1(layers.padded(0.0 * bins[:1, 0]).unsqueeze(1)))
+    positions = layers.conv_2(layers.conv_1(layers.read(bins[:, 0]).unsqueeze(1)))
+    empty = layers.conv_2(layers.conv_1(layers.read(0.0 * bins[:1, 0]).unsqueeze(1)))
     read = (positions - empty)[:, 0] > 1e-9  # [bin, position]
     for q in (0, 1, 22, 44):
         assert set(read[:, q].nonzero().flatten().tolist()) == {b % 180 for b in range(4 * q - 1, 4 * q + 8)}
@@ -138,6 +152,7 @@ def test_weights_of_format_1_keep_their_reading(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
     config = json.loads((tmp_path / "config.json").read_bytes())
     assert (config.pop("padding"), config.pop("format_version")) == ("none", FORMAT_VERSION)
+    assert (config.pop("memory_s"), config.pop("range_code")) == (0.0, "paper")  # of agents of formats 1 and 2
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 1}))
     old = read_weights(tmp_path)
     assert old.config == weights.config

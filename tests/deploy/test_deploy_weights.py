@@ -68,6 +68,8 @@ def test_damage_is_refused_in_one_sentence(tmp_path: Path) -> None:
         ("format_version", 99, "is of format 99, this version reads 1 to 3"),
         ("sensor", "wide", "sensor='wide' does not exist"),
         ("padding", "zeros", "neither 'circular' nor 'none'"),
+        ("range_code", "metres", "none of paper, nearness"),
+        ("memory_s", -1.0, "outside \\[0, 3600\\]"),
         ("critic", "none", "neither 'quantile' nor 'scalar'"),
         ("num_critics", 3, "differ in critics.2"),
         ("context", "mood", "neither 'beta' nor 'collision_weight'"),

@@ -23,6 +23,7 @@ from torch.nn import functional as F
 from rcdsac_trl.agent.float32 import made_in_float32
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
 from rcdsac_trl.system.checks import one_of
@@ -43,11 +44,12 @@ class NetworkSettings:
         head: size of every fully-connected layer after the recurrent one, and of the risk gates.
         cosines: number of cosine features of ``beta`` and of a quantile fraction.
         padding: how the convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
+        range_code: how they read a bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
         encoder: an encoder of yours as ``package.module.Class``; see
             :class:`HistoryEncoder`. None for :class:`Encoder`.
 
     Raises:
-        UserInputError: if a width is below 1, or there is no such padding or encoder.
+        UserInputError: if a width is below 1, or there is no such padding, code or encoder.
     """
 
     conv: int = 32
@@ -57,14 +59,16 @@ class NetworkSettings:
     head: int = 128
     cosines: int = 64
     padding: Padding = "circular"
+    range_code: RangeCode = "paper"
     encoder: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse widths below 1, other paddings, and an encoder that cannot be imported."""
+        """Refuse widths below 1, other readings of the bins, and an encoder that cannot be imported."""
         for name, width in self.widths.items():
             if width < 1:
                 raise UserInputError(f"network width {name} = {width} is below 1: give a positive integer")
         one_of("network.padding", self.padding, Padding)
+        one_of("network.range_code", self.range_code, RangeCode)
         if self.encoder is not None:
             _imported(self.encoder)
 
@@ -84,24 +88,30 @@ class RangeFeatures(nn.Module):
         channels: of both convolutions.
         features: of the linear layer.
         padding: how the ring is closed; see :mod:`rcdsac_trl.robot.ring`.
+        range_code: how a bin is read; see :data:`rcdsac_trl.robot.observation.RangeCode`.
     """
 
-    def __init__(self, channels: int, features: int, padding: Padding = "circular") -> None:
+    def __init__(
+        self, channels: int, features: int, padding: Padding = "circular", range_code: RangeCode = "paper"
+    ) -> None:
         """Build the layers for :data:`NUM_BINS` bins."""
         super().__init__()
         self.padding = padding
+        self.range_code = range_code
         self.conv_1 = nn.Conv1d(1, channels, KERNELS[0], stride=2)
         self.conv_2 = nn.Conv1d(channels, channels, KERNELS[1], stride=2)
         self.linear = nn.Linear(num_positions(padding) * channels, features)
 
-    def padded(self, bins: Tensor) -> Tensor:
-        """Return the bins ``[n, 180]`` with those of the ring's other end on both sides, for both convolutions."""
+    def read(self, bins: Tensor) -> Tensor:
+        """Return what both convolutions read of bins ``[n, 180]``: in their code, with the ring's ends closed."""
+        if self.range_code == "nearness":
+            bins = torch.where(bins > 0.0, MAX_RANGE_OBSERVATION - bins, 0.0)
         before, behind = RING_ENDS[self.padding]
         return torch.cat((bins[:, NUM_BINS - before :], bins, bins[:, :behind]), dim=1) if before else bins
 
     def forward(self, bins: Tensor) -> Tensor:
         """Map ``[n, 180]`` to ``[n, features]``."""
-        positions = F.relu(self.conv_2(F.relu(self.conv_1(self.padded(bins).unsqueeze(1)))))
+        positions = F.relu(self.conv_2(F.relu(self.conv_1(self.read(bins).unsqueeze(1)))))
         return F.relu(self.linear(positions.transpose(1, 2).flatten(1)))
 
 
@@ -164,7 +174,7 @@ class Encoder(HistoryEncoder):
     def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
         """Build the layers."""
         super().__init__(vectors, network)
-        self.range = RangeFeatures(network.conv, network.range, network.padding)
+        self.range = RangeFeatures(network.conv, network.range, network.padding, network.range_code)
         self.vectors = nn.ModuleList(nn.Linear(size, network.vector) for size in vectors.values())
         self.gru = nn.GRU(network.range + network.vector * len(vectors), network.memory, batch_first=True)
 

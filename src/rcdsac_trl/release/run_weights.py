@@ -86,6 +86,7 @@ def _config(agent: AgentOfRun, num_critics: int, provenance: dict[str, str | int
         provenance=provenance,
         padding=agent.network.padding,
         memory_s=agent.sensor.memory_s,
+        range_code=agent.network.range_code,
     )
 
 

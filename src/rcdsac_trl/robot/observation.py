@@ -5,6 +5,7 @@ what it was trained on.
 """
 
 import math
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,11 @@ RANGE_OFFSET = 2.5
 
 MAX_RANGE_OBSERVATION = RANGE_OFFSET + math.log10(MAX_RANGE_M)
 """Upper limit of a range observation."""
+
+
+RangeCode = Literal["paper", "nearness"]
+"""How networks read range observations: ``paper`` as they are, with 0, nothing there, beside what nearly touches;
+``nearness`` as log10(3 m / distance), which is 0 at 3 m and where nothing is, and rises evenly from there."""
 
 
 WAYPOINT_DISTANCE_LIMITS_M = (0.01, 100.0)

@@ -270,7 +270,7 @@ class CompiledActor:
         size = self._head.output.out_features // 2
         loc, scale, action = range_.new_empty(3, number, size).unbind()
         tensors = (
-            self._encoder.range.padded(range_).contiguous(),
+            self._encoder.range.read(range_).contiguous(),
             torch.cat(list(vectors), dim=-1),
             embedded.view(-1),
             following,

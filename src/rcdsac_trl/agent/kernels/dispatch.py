@@ -115,7 +115,7 @@ def _features(encoder: Any, rows: Sequence[Tensor]) -> Tensor:
     bins, *vectors = rows
     layers = encoder.range
     stack = layers.conv_1, layers.conv_2, layers.linear
-    return observation_features(layers.padded(bins), vectors, stack, list(encoder.vectors))
+    return observation_features(layers.read(bins), vectors, stack, list(encoder.vectors))
 
 
 def _evaluate(head: Any, memory: Any, action: Any, tau: Any, risk: Tensor | None = None) -> Tensor:

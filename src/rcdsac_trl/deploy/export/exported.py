@@ -210,8 +210,8 @@ def _torch_runner(module: Callable[..., tuple[Tensor, Tensor]], names: tuple[str
 def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Runner]:
     config, mask = weights.config, sensor_mask(weights.config.sensor)
     critic_encoders = [weights.part(f"critics.{number}.encoder") for number in range(config.num_critics)]
-    own = Encoders([weights.part("actor.encoder")], mask, config.padding)
-    theirs = Encoders(critic_encoders, mask, config.padding)
+    own = Encoders([weights.part("actor.encoder")], mask, config.padding, config.range_code)
+    theirs = Encoders(critic_encoders, mask, config.padding, config.range_code)
     actor, critics = Actor(weights), Critics(weights, fractions)
 
     def told(inputs: dict[str, Array]) -> tuple[Array, float | None]:

@@ -123,7 +123,7 @@ def measure_of(config: AgentConfig) -> RiskMeasure | None:
 
 
 def _network_of(config: AgentConfig) -> NetworkSettings:
-    return NetworkSettings(padding=config.padding, **config.network)  # type: ignore[arg-type]
+    return NetworkSettings(padding=config.padding, range_code=config.range_code, **config.network)  # type: ignore[arg-type]
 
 
 def _critic_head(config: AgentConfig, network: NetworkSettings) -> nn.Module:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.weights import Weights
+from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.ring import RING_ENDS, Padding
 
@@ -32,9 +33,13 @@ class Encoders:
         parts: tensors of each ``rcdsac_trl.agent.networks.Encoder``, by name; all of one shape.
         mask: the bins that the sensor has, bool [180]; the others are always 0.
         padding: how the convolutions read the ring of bins; see :mod:`rcdsac_trl.robot.ring`.
+        range_code: how they read a bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
     """
 
-    def __init__(self, parts: Sequence[Tensors], mask: NDArray[np.bool_], padding: Padding) -> None:
+    def __init__(
+        self, parts: Sequence[Tensors], mask: NDArray[np.bool_], padding: Padding, range_code: RangeCode
+    ) -> None:
+        self._reads_nearness = range_code == "nearness"
         self.number, self.size = len(parts), parts[0]["gru.weight_hh_l0"].shape[1]
         self._convolve(parts, RING_ENDS[padding])
         self._select(parts, mask)
@@ -74,6 +79,8 @@ class Encoders:
             vectors: the vector observations, one behind the other, [k].
             memories: [E, memory].
         """
+        if self._reads_nearness:
+            bins = np.where(bins > _ZERO, np.float32(MAX_RANGE_OBSERVATION) - bins, _ZERO)
         weight, bias = self._linear
         from_range = self._positions(bins).reshape(self.number, 1, -1) @ weight
         from_range += bias

@@ -95,7 +95,7 @@ class Policy:
         self._remembered = _memory_of(self.config.memory_s, self._mask)
         parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
         self._encoders = Encoders(
-            [weights.part(f"{part}.encoder") for part in parts], self._mask, weights.config.padding
+            [weights.part(f"{part}.encoder") for part in parts], self._mask, self.config.padding, self.config.range_code
         )
         self._actor = Actor(weights)
         self._critics = Critics(weights, self.fractions)

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from hashlib import sha256
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,17 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.observation import vector_observations
+from rcdsac_trl.robot.observation import RangeCode, vector_observations
 from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS, check_memory
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
 
 FORMAT_VERSION = 3
 """What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
-_UNSAID: dict[int, dict[str, Any]] = {1: {"padding": "none", "memory_s": 0.0}, 2: {"memory_s": 0.0}, FORMAT_VERSION: {}}
+_UNSAID: dict[int, dict[str, Any]] = {
+    1: {"padding": "none", "memory_s": 0.0, "range_code": "paper"},
+    2: {"memory_s": 0.0, "range_code": "paper"},
+    FORMAT_VERSION: {},
+}
 CONFIG_NAME = "config.json"
 WEIGHTS_NAME = "weights.safetensors"
 CARD_NAME = "README.md"
@@ -64,6 +68,7 @@ class AgentConfig:
         padding: how its convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
         memory_s: for how long it is told of points that it saw, s; 0: not at all. See
             :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`.
+        range_code: how its convolutions read a range bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
 
     Raises:
         UserInputError: if values do not fit together.
@@ -85,6 +90,7 @@ class AgentConfig:
     provenance: Mapping[str, str | int | float | None]
     padding: Padding = "circular"
     memory_s: float = 0.0
+    range_code: RangeCode = "paper"
 
     def __post_init__(self) -> None:
         """Refuse what no agent can be."""
@@ -108,6 +114,8 @@ class AgentConfig:
         if self.sensor not in SENSORS:
             raise UserInputError(f"sensor={self.sensor!r} does not exist; choose one of {', '.join(sorted(SENSORS))}")
         check_memory(self.memory_s)
+        if self.range_code not in get_args(RangeCode):
+            raise UserInputError(f"range_code={self.range_code!r} is none of {', '.join(get_args(RangeCode))}")
         if self.critic not in ("quantile", "scalar"):
             raise UserInputError(f"critic={self.critic!r} is neither 'quantile' nor 'scalar'")
         if set(self.network) != set(_WIDTHS) or not all(type(w) is int and w >= 1 for w in self.network.values()):
