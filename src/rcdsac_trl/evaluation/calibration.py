@@ -25,9 +25,10 @@ from rcdsac_trl.rollout.make_agent import make_loss, packed_loss, unpacked_loss
 from rcdsac_trl.seeding import stream, torch_stream
 from rcdsac_trl.storage.checkpoint import load_weights
 from rcdsac_trl.storage.checkpoint_record import find
-from rcdsac_trl.system import runtime
+from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.provenance import commit
+from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.rules import RULES_VERSION
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
@@ -40,7 +41,8 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
 
     Raises:
         UserInputError: for a missing run, critics without quantiles, a beta that is missing or outside its domain, a
-            horizon that leaves no room in an episode, a cross-evaluation of a single beta.
+            horizon that leaves no room in an episode, a cross-evaluation of a single beta, more roll-outs
+            at once than the memory holds.
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is None:
@@ -62,6 +64,10 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
             f"cross_evaluate=true holds values of beta against each other, and {folder} is asked for one: give two or "
             "more to a risk-conditioned agent, such as beta=[0.25,1], or leave cross_evaluate out"
         )
+    processes = resolve_processes(settings.num_workers, settings.num_maps)
+    simulations = max(1, processes) * len(conditions) * settings.num_states * settings.num_rollouts
+    remedy = "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, or end other programs"
+    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
     checkpoints = folder / CHECKPOINTS
     find(checkpoints, settings.checkpoint)
 
@@ -70,7 +76,7 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         for damaged in load_weights(checkpoints, settings.checkpoint, loss=loss):
             print(f"rcdsac_trl: {damaged}", file=sys.stderr)
         make = partial(_driver, settings, trained, conditions, packed_loss(loss))
-        return evaluate_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
+        return evaluate_maps(make, settings.num_maps, processes)
 
     return MeasuredRun(
         kind="calibration",
