@@ -124,26 +124,29 @@ def answer(values: CrossValues) -> str:
     """Say in how many rows the diagonal is best."""
     number = len(values.value)
     low, high = values.advantage_bounds
-    rows = int((low <= 0.0).all(1).sum())
     highest = int((values.value.argmax(1) == np.arange(number)).sum())
     others = number * (number - 1)
     return (
-        f"the diagonal is best, within its interval, in {rows} of {number} rows; it has the highest value in {highest} "
-        f"(by chance: 1), is clearly above {(high < 0.0).sum()} of {others} other cells and clearly below "
-        f"{(low > 0.0).sum()}."
+        f"the diagonal is {_best_rows(values)}; it has the highest value in {highest} (by chance: 1), is clearly above "
+        f"{(high < 0.0).sum()} of {others} other cells and clearly below {(low > 0.0).sum()}."
     )
 
 
+def _best_rows(values: CrossValues) -> str:
+    rows = (values.advantage_bounds[0] <= 0.0).all(1)
+    return f"best, within its interval, in {rows.sum()} of {len(rows)} rows"
+
+
 def cross_figure(title: str, values: Mapping[str, CrossValues], betas: Array) -> Figure:
-    """Draw a matrix a reading: on the diagonal the value, elsewhere what is above or below it."""
-    size = 1.6 + 1.15 * len(betas)
-    figure = Figure(figsize=(2 * size + 1.2, size + 1.2), layout="constrained")
+    """Draw a matrix a reading: on the diagonal its value, elsewhere how far above it; blue where beta is as it says."""
+    figure = Figure(figsize=(4.0 + 2.3 * len(betas), 1.7 + 0.8 * len(betas)), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, color=INK)
     largest = max(max(float(np.abs(of.advantage).max()) for of in values.values()), 1e-9)
     panels = figure.subplots(1, len(values))
     for axes, (reading, of) in zip(panels, values.items(), strict=True):
-        image = axes.imshow(of.advantage, cmap="RdBu_r", vmin=-largest, vmax=largest)
-        axes.set_title(f"measure of the returns {READINGS[reading]}", loc="left", fontsize=10, color=INK)
+        image = axes.imshow(of.advantage, cmap="RdBu_r", vmin=-largest, vmax=largest, aspect="auto")
+        heading = f"{READINGS[reading].capitalize()}: the diagonal is\n{_best_rows(of)}"
+        axes.set_title(heading, loc="left", fontsize=10, color=INK)
         axes.set_xticks(range(len(betas)), [f"{beta:g}" for beta in betas])
         axes.set_yticks(range(len(betas)), [f"{beta:g}" for beta in betas])
         axes.set_xlabel("β' that drives", fontsize=9, color=INK)
@@ -151,8 +154,8 @@ def cross_figure(title: str, values: Mapping[str, CrossValues], betas: Array) ->
         axes.tick_params(length=0, labelcolor=INK, labelsize=9)
         axes.spines[:].set_visible(False)
         _write_cells(axes, of, 0.6 * largest)
-    bar = figure.colorbar(image, ax=panels, shrink=0.7)
-    bar.set_label("above β' = β (below it, blue: β does what it says)", fontsize=9, color=INK)
+    bar = figure.colorbar(image, ax=panels)
+    bar.set_label("above the diagonal of the row\n(framed: its highest value)", fontsize=9, color=INK)
     bar.ax.tick_params(labelcolor=INK, labelsize=8)
     bar.outline.set_visible(False)
     return figure
@@ -165,8 +168,8 @@ def _write_cells(axes: Axes, values: CrossValues, dark: float) -> None:
         number = f"{values.value[row, column]:.1f}" if on_diagonal else f"{advantage:+.1f}"
         low, high = (values.value_bounds if on_diagonal else values.advantage_bounds)[:, row, column]
         color = "white" if abs(advantage) > dark else INK
-        axes.text(column, row - 0.12, number, ha="center", va="center", fontsize=11, color=color)
-        axes.text(column, row + 0.2, f"[{low:.1f}, {high:.1f}]", ha="center", va="center", fontsize=7.5, color=color)
+        axes.text(column, row - 0.1, number, ha="center", va="center", fontsize=11, color=color)
+        axes.text(column, row + 0.22, f"[{low:.1f}, {high:.1f}]", ha="center", va="center", fontsize=7.5, color=color)
     for row, column in enumerate(values.value.argmax(1)):
         axes.add_patch(Rectangle((column - 0.47, row - 0.47), 0.94, 0.94, fill=False, edgecolor=INK, linewidth=1.6))
 
