@@ -155,6 +155,33 @@ def test_dual_density_gives_the_same_value(name: str, beta: float) -> None:
     assert dual == pytest.approx(value(measure, beta), abs=3e-2)
 
 
+# Weights of the values of a sorted sample.
+SAMPLES = [
+    (Neutral(), 0.0, [0.25, 0.25, 0.25, 0.25]),
+    (CVaR(), 0.3, [2 / 3, 1 / 3, 0.0, 0.0, 0.0]),  # the lowest of five, and half of the next
+    (CVaR(), 1.0, [1 / 3, 1 / 3, 1 / 3]),
+    # The smallest of 1 - beta draws from the sample, with replacement.
+    (PowerLaw(), -1.0, [5 / 9, 3 / 9, 1 / 9]),
+    (PowerLaw(), -2.0, [7 / 8, 1 / 8]),
+    (Wang(), -1.0, [cdf(1.0), 1.0 - cdf(1.0)]),  # of two: psi maps that fraction to one half
+    (VaR(), 0.5, [0.0, 1.0, 0.0, 0.0]),
+]
+
+
+@pytest.mark.parametrize(("measure", "beta", "weights"), SAMPLES)
+def test_weights_of_a_sample_are_exact(measure: RiskMeasure, beta: float, weights: list[float]) -> None:
+    u = torch.arange(len(weights) + 1, dtype=torch.float64) / len(weights)
+    torch.testing.assert_close(
+        measure.inverse_psi(u, as_tensor(beta)).diff(), torch.tensor(weights, dtype=torch.float64)
+    )
+
+
+@pytest.mark.parametrize(("name", "beta"), [case for case in CASES if case[0] not in ("cvar", "var")])
+def test_the_inverse_of_psi_undoes_it(name: str, beta: float) -> None:
+    measure, u = MEASURES[name](), torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
+    torch.testing.assert_close(measure.psi(measure.inverse_psi(u, as_tensor(beta)), as_tensor(beta)), u)
+
+
 @pytest.mark.parametrize("name", ["cpw", "var"])
 def test_no_dual_density_where_there_is_none(name: str) -> None:
     with pytest.raises(NotImplementedError):

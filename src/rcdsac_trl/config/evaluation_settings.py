@@ -139,15 +139,20 @@ class CalibrationSettings:
     num_states: int
     num_rollouts: int
     horizon_steps: int
+    cross_evaluate: bool
     out: str | None
     num_workers: Workers
     threads: Threads
 
     def __post_init__(self) -> None:
-        """Refuse what is below its limit."""
+        """Refuse what is below its limit, and a cross-evaluation of nothing."""
         check_least("seed", self.seed, 0)
         for key in ("num_maps", "num_states", "num_rollouts"):
             check_least(key, getattr(self, key), 1)
+        if self.cross_evaluate and self.num_maps < 2:
+            raise UserInputError(
+                f"cross_evaluate=true gives intervals over maps, and num_maps={self.num_maps} has none: give at least 2"
+            )
         resolve_processes(self.num_workers, self.num_maps)
         runtime.resolve_threads(self.threads)
 

@@ -56,6 +56,8 @@ def roll_out(
     alpha: float,
     generator: torch.Generator,
     episode: int,
+    leaders: Sequence[int] | None = None,
+    shared_action: bool = True,
     before_step: Callable[[], None] = interruption_point,
 ) -> Branches:
     r"""Drive groups of agents that part from each other at a step of their own.
@@ -66,7 +68,7 @@ def roll_out(
     Args:
         env: G * M agents, those of a group one after the other and with the same number.
         actor: encoder and head; its actions are drawn.
-        branch_steps: G numbers k: the group does the same up to action k, and nothing together from then on.
+        branch_steps: G numbers k: the group does the same before action k, and nothing together after it.
         num_rollouts: M, agents in a group.
         num_blocks: equal blocks of the groups, whose agents draw the same noise: one a beta, so that no beta's depends
             on which others there are.
@@ -75,11 +77,18 @@ def roll_out(
         alpha: temperature.
         generator: source of the actions' noise.
         episode: number of the episode and its map.
+        leaders: for each group the agent whose actions it takes, of a group with the same numbers and the same k;
+            None: the first of its own.
+        shared_action: whether action k, too, is the leader's, as for what is predicted of a state and an action; else
+            each draws its own.
         before_step: called before each step.
     """
     encoder, head = actor[0], actor[1]
     parting = torch.tensor(branch_steps).repeat_interleave(num_rollouts)
-    leader = torch.arange(len(parting)) // num_rollouts * num_rollouts
+    if leaders is None:
+        leaders = range(0, len(parting), num_rollouts)
+    leader = torch.tensor(leaders).repeat_interleave(num_rollouts)
+    num_led = parting + int(shared_action)
     keys = [*encoder.in_keys, "action"]
     history: dict[str, list[Tensor]] = {key: [] for key in keys}
     soft, plain = torch.zeros(len(parting), dtype=torch.float64), torch.zeros(len(parting), dtype=torch.float64)
@@ -92,7 +101,7 @@ def roll_out(
         noise = torch.empty_like(loc[: len(loc) // num_blocks]).normal_(generator=generator).repeat(num_blocks, 1)
         action, log_prob = squash(loc, scale, noise)
         # Of equal rows a matrix product need not make equal bits.
-        action = torch.where((step <= parting).unsqueeze(-1), action[leader], action)
+        action = torch.where((step < num_led).unsqueeze(-1), action[leader], action)
         tensordict = tensordict.set("action", action).set(("next", STATE_KEY), state)
         if step <= max(branch_steps):
             for key in keys:

@@ -10,12 +10,14 @@ from typing import Any
 import pandas as pd
 from omegaconf import DictConfig
 
+from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import CalibrationSettings
 from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_of_run
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import measure_states
+from rcdsac_trl.evaluation.cross_evaluation import cross_evaluate, cross_tables
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
@@ -23,9 +25,10 @@ from rcdsac_trl.rollout.make_agent import make_loss, packed_loss, unpacked_loss
 from rcdsac_trl.seeding import stream, torch_stream
 from rcdsac_trl.storage.checkpoint import load_weights
 from rcdsac_trl.storage.checkpoint_record import find
-from rcdsac_trl.system import runtime
+from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.provenance import commit
+from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.rules import RULES_VERSION
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
@@ -33,11 +36,13 @@ from rcdsac_trl.world.task.world_settings import WorldSettings
 def make_calibration(cfg: DictConfig) -> MeasuredRun:
     """Make a calibration of a run; refuses before anything is written.
 
-    It writes ``predictions.csv``, ``returns.csv`` and ``calibration.json``.
+    It writes ``predictions.csv``, ``returns.csv`` and ``calibration.json``, with ``cross_evaluate`` also
+    ``cross_returns.csv`` and ``cross_distortion.csv``.
 
     Raises:
         UserInputError: for a missing run, critics without quantiles, a beta that is missing or outside its domain, a
-            horizon that leaves no room in an episode.
+            horizon that leaves no room in an episode, a cross-evaluation of a single beta, more roll-outs
+            at once than the memory holds.
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is None:
@@ -54,6 +59,15 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
             "episode, so that states can be met in it: shorten it"
         )
     conditions = trained.algo.conditions(settings.beta, None)
+    if settings.cross_evaluate and len(conditions) < 2:
+        raise UserInputError(
+            f"cross_evaluate=true holds values of beta against each other, and {folder} is asked for one: give two or "
+            "more to a risk-conditioned agent, such as beta=[0.25,1], or leave cross_evaluate out"
+        )
+    processes = resolve_processes(settings.num_workers, settings.num_maps)
+    simulations = max(1, processes) * len(conditions) * settings.num_states * settings.num_rollouts
+    remedy = "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, or end other programs"
+    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
     checkpoints = folder / CHECKPOINTS
     find(checkpoints, settings.checkpoint)
 
@@ -62,7 +76,7 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         for damaged in load_weights(checkpoints, settings.checkpoint, loss=loss):
             print(f"rcdsac_trl: {damaged}", file=sys.stderr)
         make = partial(_driver, settings, trained, conditions, packed_loss(loss))
-        return evaluate_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
+        return evaluate_maps(make, settings.num_maps, processes)
 
     return MeasuredRun(
         kind="calibration",
@@ -71,12 +85,14 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         unit="map",
         num_units=settings.num_maps,
         measure=maps,
-        findings=_findings,
+        findings=partial(_findings, trained.algo.distortion.measure),
     )
 
 
 def _default_out(settings: CalibrationSettings, run: Path, conditions: Sequence[Condition]) -> Path:
     name = f"{settings.checkpoint}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
+    if settings.cross_evaluate:
+        name += "-cross"
     return run / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
 
 
@@ -84,7 +100,7 @@ def _described(
     settings: CalibrationSettings, trained: TrainingSettings, conditions: Sequence[Condition]
 ) -> dict[str, Any]:
     """Say what is measured and how."""
-    return {
+    described = {
         "agent": trained.algo.name,
         "measure": trained.algo.distortion.name,
         "sensor": trained.sensor.name,
@@ -104,6 +120,7 @@ def _described(
         "rules_version": RULES_VERSION,
         "commit": commit(),
     }
+    return described | ({"cross_evaluate": True} if settings.cross_evaluate else {})
 
 
 @contextlib.contextmanager
@@ -133,15 +150,17 @@ def _driver(
         conditions=[condition for condition in conditions for _ in range(group)],
     )
     latest = trained.task.episode_steps - settings.horizon_steps
+    betas = [condition.beta for condition in conditions]
 
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
-        steps = stream(settings.seed, "calibration steps", map_index).integers(latest, size=settings.num_states)
-        return measure_states(
+        drawn = stream(settings.seed, "calibration steps", map_index).integers(latest, size=settings.num_states)
+        steps = drawn.tolist()
+        rows = measure_states(
             env,
             loss,
-            betas=[condition.beta for condition in conditions],
+            betas=betas,
             conditioned=trained.algo.network_measure is not None,
-            branch_steps=steps.tolist(),
+            branch_steps=steps,
             num_rollouts=settings.num_rollouts,
             horizon_steps=settings.horizon_steps,
             memory_steps=trained.learner.sequence_length,
@@ -150,6 +169,20 @@ def _driver(
             map_index=map_index,
             before_step=before_step,
         )
+        if settings.cross_evaluate:
+            rows += cross_evaluate(
+                env,
+                loss.actor_network,
+                betas=betas,
+                branch_steps=steps,
+                num_rollouts=settings.num_rollouts,
+                horizon_steps=settings.horizon_steps,
+                gamma=trained.learner.gamma,
+                generator=torch_stream(settings.seed, "cross-evaluation actions", map_index),
+                map_index=map_index,
+                before_step=before_step,
+            )
+        return rows
 
     try:
         yield drive
@@ -157,14 +190,15 @@ def _driver(
         env.close()
 
 
-def _findings(rows: Rows) -> Findings:
+def _findings(measure: RiskMeasure, rows: Rows) -> Findings:
     rows = sorted(rows, key=lambda row: (row["beta"] or 0.0, row["map"], row["state"]))
-    return Findings(
-        {
-            "predictions.csv": _predictions(rows).to_csv(index=False, float_format="%.6g"),
-            "returns.csv": _returns(rows).to_csv(index=False, float_format="%.6g"),
-        }
-    )
+    crossed = [row for row in rows if "history_beta" in row]
+    rows = [row for row in rows if "history_beta" not in row]
+    tables = {
+        "predictions.csv": _predictions(rows).to_csv(index=False, float_format="%.6g"),
+        "returns.csv": _returns(rows).to_csv(index=False, float_format="%.6g"),
+    }
+    return Findings(tables | (cross_tables(crossed, measure) if crossed else {}))
 
 
 _STATE = ("beta", "map", "state", "step")

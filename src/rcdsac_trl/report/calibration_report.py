@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from rcdsac_trl.report.cross_evaluation_report import write_cross_evaluation
 from rcdsac_trl.report.statistics import Array, lower_mean
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, limits, shades, style
 
@@ -157,14 +158,21 @@ def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFr
 
 
 def write_calibration(folder: Path) -> str:
-    """Write ``calibration.csv`` and ``.png`` of a folder that ``calibrate`` wrote; return the table as text."""
+    """Write ``calibration.csv`` and ``.png`` of a folder that ``calibrate`` wrote; return the table as text.
+
+    Where the folder holds a cross-evaluation, it is written and said, too.
+    """
     described = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
     predictions, returns = (pd.read_csv(folder / f"{name}.csv") for name in ("predictions", "returns"))
     table = calibration_table(predictions, returns, described["gamma"], described["horizon_steps"])
     table.to_csv(folder / "calibration.csv", index=False, float_format="%.6g")
     title = f"{described['agent']}, sensor {described['sensor']}, {described['checkpoint']}: predicted and real returns"
     calibration_figure(title, predictions, returns).savefig(folder / "calibration.png", dpi=130)
-    return str(table.set_index("beta").T.to_string(float_format="%.3f"))
+    text = str(table.set_index("beta").T.to_string(float_format="%.3f"))
+    # Folders of before it could be asked for do not mention it.
+    if described.get("cross_evaluate", False):
+        text += f"\n\n{write_cross_evaluation(folder, described)}"
+    return text
 
 
 def _arrays(states: pd.DataFrame, returns: pd.DataFrame) -> tuple[Array, Array]:

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Statistic = Callable[[Array], float]
 
 CONFIDENCE = 0.95
+_BOUNDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2
 DRAWS = 2000
 """Resamples of an interval."""
 PERMUTATIONS = 20_000
@@ -135,6 +136,25 @@ def bootstrap(values: Array, statistic: Statistic = mean) -> Interval:
         drawn = np.array([statistic(values[:, maps]) for maps in chosen])
     of_seeds = np.array([statistic(values[seed]) for seed in range(len(values))])
     return _interval(statistic(values), drawn + _errors_of_seeds(DRAWS, of_seeds))
+
+
+def bootstrap_maps(values: Array, statistic: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
+    """Return a statistic that is an array, such as a table, and the bounds of its confidence intervals.
+
+    Every resample of the maps serves the whole array, so differences inside it are paired.
+
+    Args:
+        values: ``[M, ..]``, of one agent.
+        statistic: of as many maps, some of them drawn twice.
+
+    Example:
+        >>> value, low, high = bootstrap_maps(np.array([[0.0], [0.0], [6.0]]), lambda maps: maps.mean(0))
+        >>> value.item(), low.item(), high.item()
+        (2.0, 0.0, 6.0)
+    """
+    chosen, _ = _resamples(len(values), DRAWS, PERMUTATIONS)
+    low, high = np.quantile([statistic(values[maps]) for maps in chosen], _BOUNDS, axis=0)
+    return statistic(values), low, high
 
 
 def compare(first: Array, second: Array) -> Comparison:
@@ -254,7 +274,7 @@ def _improvements(first: Array, second: Array) -> Array:
 def _interval(value: float, drawn: Array) -> Interval:
     if np.isnan(drawn).all():  # nobody ever measured it, such as a time to goals that none reached
         return Interval(float("nan"), float("nan"), float("nan"))
-    low, high = np.nanquantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low, high = np.nanquantile(drawn, _BOUNDS)
     return Interval(float(value), float(low), float(high))
 
 
