@@ -69,7 +69,7 @@ def test_damage_is_refused_in_one_sentence(tmp_path: Path) -> None:
         ("sensor", "wide", "sensor='wide' does not exist"),
         ("padding", "zeros", "neither 'circular' nor 'none'"),
         ("range_code", "metres", "none of paper, nearness"),
-        ("memory_s", -1.0, "outside \\[0, 3600\\]"),
+        ("memory_s", -1.0, "is outside [0, 3600]"),
         ("critic", "none", "neither 'quantile' nor 'scalar'"),
         ("num_critics", 3, "differ in critics.2"),
         ("context", "mood", "neither 'beta' nor 'collision_weight'"),
