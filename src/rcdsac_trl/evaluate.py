@@ -2,7 +2,11 @@
 
 from rcdsac_trl.cli import Command
 
-main = Command("evaluate", "rcdsac_trl.evaluation.evaluation:make_evaluation")
+main = Command(
+    "evaluate",
+    "rcdsac_trl.evaluation.evaluation:make_evaluation",
+    look="rcdsac_trl.config.first_look:look_at_evaluation",
+)
 
 if __name__ == "__main__":
     main()
