@@ -201,7 +201,7 @@ def read_arguments(argv: list[str]) -> Namespace | None:
     if len(chosen) > 1:
         raise UserInputError(f"{' and '.join(chosen)} do not go together: leave all but one out")
     for override in args.overrides:
-        if key_of(override) == "hydra.mode":
+        if key_of(override) in ("hydra", "hydra.mode"):
             raise UserInputError(f"{override} is not for users: leave it out; `train -m` runs several trainings")
     return None if args.help or args.hydra_help or args.cfg or args.info else args
 

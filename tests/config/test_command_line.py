@@ -55,7 +55,9 @@ def test_hydra_gets_overrides_first_and_paths_in_full(
     assert f"out: {tmp_path}/maps.png\n" in shown
 
 
-@pytest.mark.parametrize("override", ["hydra.mode=MULTIRUN", "+hydra.mode=multirun", "++hydra.mode=RUN"])
+@pytest.mark.parametrize(
+    "override", ["hydra.mode=MULTIRUN", "+hydra.mode=multirun", "++hydra.mode=RUN", "hydra={mode: MULTIRUN}"]
+)
 def test_there_is_one_way_to_several_jobs(override: str) -> None:
     with pytest.raises(UserInputError, match=r"leave it out; `train -m` runs several trainings"):
         read_arguments([POW, override, "seed=0,1"])

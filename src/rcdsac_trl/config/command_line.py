@@ -29,9 +29,8 @@ def expanded(override: str) -> str:
         UserInputError: for a user or a variable that does not exist: the folder would be called as it is written.
 
     Example:
-        >>> os.environ["DISK"] = "/mnt/a"
-        >>> expanded("out=$DISK/evaluation"), expanded("~learner.gamma")
-        ('out=/mnt/a/evaluation', '~learner.gamma')
+        >>> expanded("out=~/x") == expanded("out=$HOME/x"), expanded("~learner.gamma")
+        (True, '~learner.gamma')
     """
     with_home = _HOME.sub(lambda found: _home(override, found), override)
     return _VARIABLE.sub(lambda found: _variable(override, found), with_home)
@@ -95,5 +94,10 @@ def several(override: str, *, as_jobs: bool) -> str:
 
 
 def folder_of(override: str) -> Path:
-    """Return the folder that an override names, as it is written there."""
+    """Return the folder that an override names, with or without quotes.
+
+    Example:
+        >>> folder_of("hydra.run.dir='runs/a'").as_posix()
+        'runs/a'
+    """
     return Path(override.partition("=")[2].strip("'\""))

@@ -1,7 +1,7 @@
 """What an evaluation, a calibration, an export or a publication may choose: the roots of their files in ``conf/``."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
@@ -147,7 +147,7 @@ class EvaluationSettings:
 def _changed(section: Section, values: Mapping[str, Any] | None, name: str) -> Section:
     if not values:
         return section
-    return read(type(section), {f.name: getattr(section, f.name) for f in fields(section)} | dict(values), name)
+    return read(type(section), {**vars(section), **values}, name)
 
 
 @dataclass(frozen=True)
