@@ -92,12 +92,12 @@ def untrained(folder: Path) -> Path:
     from rcdsac_trl.rollout.make_agent import make_average, make_loss
     from rcdsac_trl.storage.checkpoint import Checkpoints
     from rcdsac_trl.storage.checkpoint_record import Progress
-    from rcdsac_trl.training import run_log
+    from rcdsac_trl.training.run_folder import start_run_folder
 
     cfg = compose("train", ["+algo=rcdsac_pow", "logger=none"])
     settings = training_settings(cfg)
     run, out = folder / "run", folder / "weights"
-    run_log.start_run_folder(run, cfg, {})
+    start_run_folder(run, cfg, {})
     loss = make_loss(settings, "cpu")
     parts = {"loss": loss, "average": make_average(loss, settings.learner)}
     Checkpoints(run / "checkpoints", parts, replay=None, keep=1).save(Progress(), {})

@@ -56,12 +56,12 @@ def untrained(folder: Path, overrides: list[str]) -> Path:
     from rcdsac_trl.rollout.make_agent import make_average, make_loss
     from rcdsac_trl.storage.checkpoint import Checkpoints
     from rcdsac_trl.storage.checkpoint_record import Progress
-    from rcdsac_trl.training import run_log
+    from rcdsac_trl.training.run_folder import start_run_folder
 
     cfg = compose("train", ["+algo=rcdsac_pow", "logger=none", *overrides])
     settings = training_settings(cfg)
     folder.mkdir(parents=True)
-    run_log.start_run_folder(folder, cfg, {})
+    start_run_folder(folder, cfg, {})
     loss = make_loss(settings, "cpu")
     average = make_average(loss, settings.learner)
     Checkpoints(folder / CHECKPOINTS, {"loss": loss, "average": average}, replay=None, keep=1).save(Progress(), {})

@@ -19,7 +19,7 @@ from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.storage.checkpoint import Checkpoints
 from rcdsac_trl.storage.checkpoint_record import Progress
-from rcdsac_trl.training import run_log
+from rcdsac_trl.training.run_folder import start_run_folder
 from rcdsac_trl.training.setup import check_training, make_trainer
 from rcdsac_trl.training.trainer import Trainer
 
@@ -87,7 +87,7 @@ def untrained_run(folder: Path, row: str, *overrides: str) -> tuple[Path, LossMo
     with torch.no_grad():
         for parameter in average.parameters():
             parameter += 0.01
-    run_log.start_run_folder(folder, cfg, {})
+    start_run_folder(folder, cfg, {})
     components = {"loss": loss, "average": average}
     Checkpoints(folder / "checkpoints", components, replay=None, keep=1).save(Progress(updates=7), {})
     return folder, loss, average

@@ -6,6 +6,7 @@ main = Command(
     "calibrate",
     "rcdsac_trl.evaluation.calibration:make_calibration",
     describe="rcdsac_trl.report.calibration_report:write_calibration",
+    look="rcdsac_trl.config.first_look:look_at_calibration",
 )
 
 if __name__ == "__main__":

@@ -13,7 +13,8 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
-from rcdsac_trl.config.compose import combinations, compose, output_folder
+from rcdsac_trl.config.command_line import expanded, key_of
+from rcdsac_trl.config.compose import combinations, compose, output_folder, with_sections
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.system.resources import fault_sentence
@@ -37,11 +38,14 @@ class Command:
         make: takes the composed config, refuses what cannot work, writes nothing, and returns what has a ``run()`` that
             works, writes and prints.
         describe: puts a folder of results into words; ``run`` is given it.
+        look: takes the composed config and refuses what can be told without torch, so that a mistake does not wait for
+            the imports of ``make``.
     """
 
     name: str
     make: str | Callable[[DictConfig], Any]
     describe: str | None = None
+    look: str | None = None
 
     def check(self, cfg: DictConfig) -> None:
         """Refuse what cannot work, before anything is written."""
@@ -54,7 +58,8 @@ class Command:
             described_by = () if self.describe is None else (_function(self.describe),)
             _function(self.make)(cfg).run(*described_by)
 
-        entry_point(self.name, check=self.check)(task)()
+        look = None if self.look is None else late(self.look)
+        entry_point(self.name, check=self.check, look=look)(task)()
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,7 @@ def entry_point(
     config_name: str,
     *,
     check: Task,
+    look: Task | None = None,
     check_folder: Callable[[Path], None] | None = None,
     instead: Callable[[list[str], bool], bool] | None = None,
 ) -> Callable[[Task], Callable[[], None]]:
@@ -96,7 +102,8 @@ def entry_point(
         config_name: the root config in ``conf/``.
         check: called with the composed config before Hydra creates a folder; raises
             :class:`~rcdsac_trl.errors.UserInputError` for what cannot work.
-        check_folder: called likewise with the folder that each run would write into.
+        look: called likewise, before it; refuses what can be told without torch.
+        check_folder: called between the two with the folder that each run would write into.
         instead: called first, with the overrides and whether there are several jobs; returns whether it did what the
             call asks for, so that Hydra has nothing to start.
     """
@@ -106,7 +113,7 @@ def entry_point(
             arguments = read_arguments(sys.argv[1:])
             if instead is not None and arguments is not None and instead(arguments.overrides, arguments.multirun):
                 return
-            precheck(config_name, sys.argv[1:], check, check_folder)
+            precheck(config_name, sys.argv[1:], check, look, check_folder)
             _hydra_main(config_name, task)
 
         return partial(_program, start)
@@ -121,6 +128,7 @@ def _hydra_main(config_name: str, task: Task) -> None:
         except Exception as error:  # Hydra would print it in its own way
             _fail_or_raise(error)
 
+    sys.argv[1:] = _in_hydras_order(config_name, sys.argv[1:])
     guarded.__module__ = f"rcdsac_trl.{config_name}"  # by which Hydra names the program
     hydra.main(version_base="1.3", config_path=str(CONF_DIR), config_name=config_name)(guarded)()
 
@@ -183,20 +191,52 @@ def read_arguments(argv: list[str]) -> Namespace | None:
     Raises:
         UserInputError: for an option that does not exist, cannot be used, or does not go with another.
     """
-    args, unknown = get_args_parser().parse_known_args(argv)
+    args, unknown = _parsed(argv)
     if unknown:
-        raise UserInputError(f"there is no option {unknown[0]}: --help lists them")
+        raise UserInputError(f"there is no option {unknown[0]}: --help lists them; put a value with spaces in quotes")
     for option in ("config_path", "config_name", "config_dir"):
         if getattr(args, option) is not None:
             raise UserInputError(f"--{option.replace('_', '-')} cannot be used: choose with overrides, <key>=<value>")
     chosen = [f"--{option}" for option in ("run", "multirun", "cfg", "info") if getattr(args, option)]
     if len(chosen) > 1:
         raise UserInputError(f"{' and '.join(chosen)} do not go together: leave all but one out")
+    for override in args.overrides:
+        if key_of(override) in ("hydra", "hydra.mode"):
+            raise UserInputError(f"{override} is not for users: leave it out; `train -m` runs several trainings")
     return None if args.help or args.hydra_help or args.cfg or args.info else args
 
 
+def _parsed(argv: list[str]) -> tuple[Namespace, list[str]]:
+    """Read overrides and options, which may stand in any order; also return what is neither."""
+    parser = get_args_parser()
+
+    def refuse(message: str) -> NoReturn:
+        raise UserInputError(f"{message}: --help lists the options")
+
+    parser.error = refuse  # type: ignore[method-assign]  # it would print how all options are used, and leave
+    args, unknown = parser.parse_known_intermixed_args(argv)
+    args.overrides = [expanded(override) for override in args.overrides]
+    return args, unknown
+
+
+def _in_hydras_order(config_name: str, argv: list[str]) -> list[str]:
+    """Put the overrides first, as Hydra wants them, and what a shell would have expanded into them."""
+    args, _ = _parsed(argv)
+    given, options = list(args.overrides), []
+    for word in argv:
+        if given and not word.startswith("-") and expanded(word) == given[0]:
+            given.pop(0)
+        else:
+            options.append(word)
+    return [*with_sections(config_name, args.overrides), *options]
+
+
 def precheck(
-    config_name: str, argv: list[str], check: Task, check_folder: Callable[[Path], None] | None = None
+    config_name: str,
+    argv: list[str],
+    check: Task,
+    look: Task | None = None,
+    check_folder: Callable[[Path], None] | None = None,
 ) -> None:
     """Compose and check the config, in a multirun that of every job, without writing anything.
 
@@ -205,7 +245,12 @@ def precheck(
     args = read_arguments(argv)
     if args is None:
         return
-    for overrides in combinations(args.overrides) if args.multirun else [args.overrides]:
-        check(compose(config_name, overrides))
+    jobs = combinations(args.overrides) if args.multirun else [args.overrides]
+    composed = [compose(config_name, overrides) for overrides in jobs]
+    if look is not None:
+        for cfg in composed:
+            look(cfg)
     if check_folder is not None:
         check_folder(output_folder(config_name, args.overrides))
+    for cfg in composed:
+        check(cfg)

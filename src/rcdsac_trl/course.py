@@ -6,6 +6,7 @@ main = Command(
     "course",
     "rcdsac_trl.evaluation.course.course_run:make_course",
     describe="rcdsac_trl.report.course_table:write_course",
+    look="rcdsac_trl.config.first_look:look_at_course",
 )
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ main = Command(
     "evaluate",
     "rcdsac_trl.evaluation.evaluation:make_evaluation",
     describe="rcdsac_trl.report.collision_report:write_collisions",
+    look="rcdsac_trl.config.first_look:look_at_evaluation",
 )
 
 if __name__ == "__main__":

@@ -2,7 +2,11 @@
 
 from rcdsac_trl.cli import Command
 
-main = Command("export", "rcdsac_trl.release.agent_export:make_export")
+main = Command(
+    "export",
+    "rcdsac_trl.release.agent_export:make_export",
+    look="rcdsac_trl.config.first_look:look_at_export",
+)
 
 if __name__ == "__main__":
     main()

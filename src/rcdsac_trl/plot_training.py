@@ -13,10 +13,9 @@ from rcdsac_trl.cli import Command
 from rcdsac_trl.config.run_config import CONFIG_NAME
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.learning_curve import CONDITIONS, PANELS, learning_curve
-from rcdsac_trl.rollout.metrics import validation_score
 from rcdsac_trl.system.resources import check_picture
 from rcdsac_trl.tables import read_growing
-from rcdsac_trl.training.run_log import TRAINING_TABLE
+from rcdsac_trl.training.run_folder import TRAINING_TABLE
 
 
 @dataclass(frozen=True)
@@ -66,6 +65,8 @@ def best_updates(episodes: pd.DataFrame, episode_steps: int) -> int:
         episodes: one row an episode, as training writes ``validation_episodes.csv``.
         episode_steps: length of an episode.
     """
+    from rcdsac_trl.rollout.metrics import validation_score  # late: torch takes a second, which no mistake waits for
+
     # As the trainer does it: every condition counts the same, and only a higher score replaces the best.
     by_condition = episodes.groupby(["updates", *CONDITIONS], dropna=False)[list(PANELS)].mean()
     numbers = by_condition.index.unique("updates").to_numpy()

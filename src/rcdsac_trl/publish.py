@@ -6,6 +6,7 @@ main = Command(
     "publish",
     "rcdsac_trl.release.publication:make_publication",
     describe="rcdsac_trl.report.card:driving_section",
+    look="rcdsac_trl.config.first_look:look_at_publication",
 )
 
 if __name__ == "__main__":

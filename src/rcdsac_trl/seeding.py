@@ -5,9 +5,12 @@ purpose, so that what one part draws never changes what another part sees.
 """
 
 import hashlib
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:
+    import torch
 
 
 def seed_sequence(seed: int, purpose: str, *index: int) -> np.random.SeedSequence:
@@ -39,6 +42,8 @@ def torch_seed(seed: int, purpose: str, *index: int) -> int:
     return int(seed_sequence(seed, purpose, *index).generate_state(1, np.uint64)[0] >> 1)
 
 
-def torch_stream(seed: int, purpose: str, *index: int, device: torch.device | str = "cpu") -> torch.Generator:
+def torch_stream(seed: int, purpose: str, *index: int, device: "torch.device | str" = "cpu") -> "torch.Generator":
     """Return a torch generator for one purpose; see :func:`seed_sequence`."""
+    import torch  # late: maps, and with them the settings, need none
+
     return torch.Generator(device=device).manual_seed(torch_seed(seed, purpose, *index))

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
     """Run a sweep, or continue a run, if the call asks for that; return whether it did. Hydra has no part in either."""
+    # Each imported as it is needed: a mistake is told before torch is imported.
     from rcdsac_trl.experiments.sweep_jobs import check_single, make_sweep
     from rcdsac_trl.training.resume import run_to_continue
-    from rcdsac_trl.training.setup import resume_training
 
     if multirun:
         make_sweep(overrides).run()
@@ -23,6 +23,8 @@ def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
     folder = run_to_continue(overrides)
     if folder is None:
         return False
+    from rcdsac_trl.training.setup import resume_training
+
     trainer = resume_training(folder)
     if trainer is None:
         print(f"{folder} is finished: nothing is left to do")
@@ -33,8 +35,9 @@ def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
 
 @entry_point(
     "train",
+    look=late("rcdsac_trl.config.run_config:settings_of_new_run"),
+    check_folder=late("rcdsac_trl.training.run_folder:check_folder"),
     check=late("rcdsac_trl.training.setup:check_training"),
-    check_folder=late("rcdsac_trl.training.run_log:check_folder"),
     instead=sweep_or_continue,
 )
 def main(cfg: DictConfig) -> None:

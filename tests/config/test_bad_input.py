@@ -96,7 +96,7 @@ def refused_or_read(read: Callable[[], Any]) -> Any:
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do not ask git for the commit in every example."""
-    monkeypatch.setattr("rcdsac_trl.training.run_log.commit", lambda: "none")
+    monkeypatch.setattr("rcdsac_trl.training.run_folder.commit", lambda: "none")
 
 
 # ------------------------------------------------------------------------------------------------ configs

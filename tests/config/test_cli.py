@@ -246,7 +246,12 @@ RUN = "run=<the tiny run>"
         ([RUN, "beta=[-1]", "threads=all"], "threads=all must be a whole number or auto"),
         ([RUN, "beta=[-1]", "device=tpu"], "device=tpu is not supported"),
         ([RUN, "beta=[-1]", "map=moon"], "map=moon does not exist: choose one of "),
-        ([RUN, "beta=[-1]", "task.episode_steps=3"], "task.episode_steps needs a choice of task: add task=<name>"),
+        ([RUN, "beta=[-1]", "task.episode_step=3"], "there is no key task.episode_step: did you mean task.episode_st"),
+        ([RUN, "beta=[-1]", "task.episode_steps=few"], "task.episode_steps=few must be a whole number"),
+        ([RUN, "beta=[-1]", "map.num_movers=-1"], "num_movers is -1 but must be"),
+        ([RUN, "beta=[-1]", "+sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
+        (["baseline=pursuit", "sensor.max_range_m=10"], "there is no key sensor.max_range_m: sensor has name"),
+        (["baseline=pursuit", "algo.beta=-1"], "there is no key algo.beta"),
         (
             [RUN, "beta=[-1]", "num_maps=2", "record=true", "video.map=2"],
             "video.map=2 is not among the 2 evaluated: lower it, or raise num_maps",

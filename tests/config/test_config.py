@@ -243,7 +243,7 @@ def test_read_makes_nested_settings_with_tuples() -> None:
         ({"share": float("nan")}, "top.share=nan must be a number"),
         ({"share": float("inf")}, "top.share=inf must be a number"),
         ({"on": 1}, "top.on=1 must be true or false"),
-        ({"title": 7}, "top.title=7 must be text"),
+        ({"title": 7}, "top.title=7 must be text; as a text: 'top.title=\"7\"'"),
         ({"kind": "z"}, "top.kind=z must be one of x, y"),
         ({"limits": [1]}, "top.limits=[1] must be a list of 2 numbers in brackets"),
         ({"limits": [1, "b"]}, "top.limits=[1, 'b'] must be a list of 2 numbers in brackets"),

@@ -16,6 +16,9 @@ import pytest
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.rollout.evaluation_pool import Drive, EvaluationPool, Rows, evaluate_maps
 from rcdsac_trl.system.processes import WorkerError, resolve_processes, resolve_processes_beside
+from rcdsac_trl.training.setup import check_machine
+from rcdsac_trl.world.task.env import make_env
+from tiny import tiny_settings
 
 
 @contextlib.contextmanager
@@ -47,6 +50,28 @@ def test_every_map_is_driven_once_and_by_a_process_of_its_own() -> None:
     assert sorted(row["map"] for row in rows) == list(range(7))
     assert os.getpid() not in {row["process"] for row in rows}
     assert list(evaluate_maps(counting, 2, processes=0)) == [[{"map": i, "process": os.getpid()}] for i in range(2)]
+
+
+@pytest.fixture
+def daemonic(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make this process what a worker of `multiprocessing.Pool` is."""
+    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+
+
+@pytest.mark.usefixtures("daemonic")
+def test_a_daemonic_process_is_told_what_to_do_where_it_cannot_start_others() -> None:
+    asked: list[Callable[[], object]] = [
+        lambda: list(evaluate_maps(counting, 2, processes=2)),
+        lambda: make_env(num_agents=2, num_workers=2),
+        lambda: check_machine(tiny_settings("sac", "collector.num_processes=2")),
+        lambda: check_machine(tiny_settings("sac", "validation.processes=1")),
+        lambda: check_machine(tiny_settings("sac", "collector=parallel_env", "world.num_workers=2")),
+    ]
+    for ask in asked:
+        with pytest.raises(UserInputError, match=r"daemonic process.* may start no processes: use concurrent"):
+            ask()
+    assert len(list(evaluate_maps(counting, 2, processes=0))) == 2
+    check_machine(tiny_settings("sac", "collector.num_processes=0", "validation.processes=0"))
 
 
 def test_a_process_that_dies_ends_the_evaluation_and_leaves_none_behind() -> None:

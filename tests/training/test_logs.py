@@ -11,10 +11,12 @@ import pytest
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from rcdsac_trl.config.training_settings import LoggerSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.rollout.metrics import METRICS
 from rcdsac_trl.system import provenance
-from rcdsac_trl.training.run_log import RunLog, check_backends, start_run_folder
+from rcdsac_trl.training.run_folder import start_run_folder
+from rcdsac_trl.training.run_log import RunLog
 from tiny import AGENTS, ITERATIONS, STEPS, UPDATES, tiny_cfg
 
 
@@ -78,10 +80,10 @@ def test_a_folder_holds_one_run(tmp_path: Path) -> None:
 
 
 def test_unknown_backends_are_refused() -> None:
-    check_backends(())
-    check_backends(("csv", "tensorboard"))
+    LoggerSettings(()).check_backends()
+    LoggerSettings(("csv", "tensorboard")).check_backends()
     with pytest.raises(UserInputError, match=r"logger\.backends holds 'excel': choose among csv, tensorboard, wandb"):
-        check_backends(("csv", "excel"))
+        LoggerSettings(("csv", "excel")).check_backends()
 
 
 EXPECTED_SCALARS = {

@@ -24,7 +24,7 @@ from torchrl.checkpoint import Checkpoint
 from rcdsac_trl import train
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import Progress, folders, newest
-from rcdsac_trl.training.run_log import cut, lengths
+from rcdsac_trl.training.run_folder import cut, lengths
 from rcdsac_trl.training.setup import resume_training
 from tiny import TINY, tiny_trainer
 

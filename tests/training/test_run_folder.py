@@ -25,10 +25,10 @@ STARTER = """
 import sys, time
 from pathlib import Path
 from rcdsac_trl import train
-from rcdsac_trl.training import run_log
+from rcdsac_trl.training import run_folder
 
 mine, other = Path(sys.argv.pop(1)), Path(sys.argv.pop(1))
-check_folder = run_log.check_folder
+check_folder = run_folder.check_folder
 
 def checked_by_both(folder):
     check_folder(folder)
@@ -36,7 +36,7 @@ def checked_by_both(folder):
     while not other.exists():
         time.sleep(0.01)
 
-run_log.check_folder = checked_by_both
+run_folder.check_folder = checked_by_both
 train.main()
 """
 

@@ -14,68 +14,21 @@ place where it knows the module.
 import importlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rcdsac_trl.agent.float32 import made_in_float32
+from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
-from rcdsac_trl.system.checks import one_of
 
 #: Bounds of the policy's log standard deviation.
 LOG_STD_RANGE = (-20.0, 2.0)
-
-
-@dataclass(frozen=True)
-class NetworkSettings:
-    """Layers of encoders and heads; the defaults are the paper's as far as it states them.
-
-    Args:
-        conv: channels of both convolutions.
-        range: features of the range observation.
-        vector: features of each vector observation.
-        memory: size of the recurrent state.
-        head: size of every fully-connected layer after the recurrent one, and of the risk gates.
-        cosines: number of cosine features of ``beta`` and of a quantile fraction.
-        padding: how the convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
-        range_code: how they read a bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
-        encoder: an encoder of yours as ``package.module.Class``; see
-            :class:`HistoryEncoder`. None for :class:`Encoder`.
-
-    Raises:
-        UserInputError: if a width is below 1, or there is no such padding, code or encoder.
-    """
-
-    conv: int = 32
-    range: int = 128
-    vector: int = 32
-    memory: int = 128
-    head: int = 128
-    cosines: int = 64
-    padding: Padding = "circular"
-    range_code: RangeCode = "paper"
-    encoder: str | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse widths below 1, other readings of the bins, and an encoder that cannot be imported."""
-        for name, width in self.widths.items():
-            if width < 1:
-                raise UserInputError(f"network width {name} = {width} is below 1: give a positive integer")
-        one_of("network.padding", self.padding, Padding)
-        one_of("network.range_code", self.range_code, RangeCode)
-        if self.encoder is not None:
-            _imported(self.encoder)
-
-    @property
-    def widths(self) -> dict[str, int]:
-        """The sizes of the layers, by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, int)}
 
 
 @made_in_float32
@@ -204,10 +157,15 @@ class Encoder(HistoryEncoder):
 
 def encoder_class(network: NetworkSettings) -> type[HistoryEncoder]:
     """Return :class:`Encoder`, or the class that ``network.encoder`` names."""
-    return Encoder if network.encoder is None else _imported(network.encoder)
+    return Encoder if network.encoder is None else imported_encoder(network.encoder)
 
 
-def _imported(path: str) -> type[HistoryEncoder]:
+def imported_encoder(path: str) -> type[HistoryEncoder]:
+    """Import an encoder of a user's.
+
+    Raises:
+        UserInputError: if it cannot be imported, or is none.
+    """
     module, _, name = path.rpartition(".")
     try:
         found = getattr(importlib.import_module(module), name)

@@ -10,14 +10,16 @@ One sign convention holds for all of them: returns are rewards, and a *smaller* 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, TypeVar
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from rcdsac_trl.errors import UserInputError
 
-Scalar = TypeVar("Scalar", float, Tensor)
+# Settings are read by this module's ranges: what is wrong there is told before torch is imported, which takes a second.
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+Scalar = TypeVar("Scalar", float, "Tensor")
 
 # Of an interval of length 1 they leave less than the spacing of float64 at 1.
 _HALVINGS = 60
@@ -56,6 +58,7 @@ class RiskMeasure(ABC):
         UserInputError: if the range is empty or leaves the domain.
 
     Example:
+        >>> import torch
         >>> measure = CVaR()
         >>> measure.psi(torch.tensor([0.0, 0.5, 1.0]), torch.tensor(0.5))
         tensor([0.0000, 0.2500, 0.5000])
@@ -82,10 +85,10 @@ class RiskMeasure(ABC):
             )
 
     @abstractmethod
-    def psi(self, tau: Tensor, beta: Tensor) -> Tensor:
+    def psi(self, tau: "Tensor", beta: "Tensor") -> "Tensor":
         """Return the distorted fractions; ``tau`` in [0, 1] and ``beta`` broadcast against each other."""
 
-    def weight(self, u: Tensor, beta: Tensor) -> Tensor:
+    def weight(self, u: "Tensor", beta: "Tensor") -> "Tensor":
         r"""Return the dual density at the fraction ``u``.
 
         It is :math:`g'(u)` with :math:`g = \psi^{-1}`, so that the value is :math:`\int_0^1 g'(u)\, Z_u\, du`.
@@ -132,8 +135,10 @@ class RiskMeasure(ABC):
         """Map uniform numbers in [0, 1) to ``beta`` in the sampled range."""
         return self.low + (self.high - self.low) * u
 
-    def sample(self, shape: Sequence[int], generator: torch.Generator) -> Tensor:
+    def sample(self, shape: Sequence[int], generator: "torch.Generator") -> "Tensor":
         """Draw ``beta`` uniformly over [``low``, ``high``], float32 of ``shape`` on the generator's device."""
+        import torch
+
         return self.from_uniform(
             torch.rand(tuple(shape), generator=generator, device=generator.device, dtype=torch.float32)
         )
@@ -173,13 +178,13 @@ class Neutral(RiskMeasure):
     domain: ClassVar[Interval] = Interval(0.0, 0.0)
     neutral_beta: ClassVar[float | None] = 0.0
 
-    def psi(self, tau: Tensor, beta: Tensor) -> Tensor:
+    def psi(self, tau: "Tensor", beta: "Tensor") -> "Tensor":
         """Return ``tau``, broadcast against ``beta``."""
-        return tau + torch.zeros_like(beta)
+        return tau + 0.0 * beta
 
-    def weight(self, u: Tensor, beta: Tensor) -> Tensor:
+    def weight(self, u: "Tensor", beta: "Tensor") -> "Tensor":
         """Return ones: every quantile counts the same."""
-        return torch.ones_like(u + beta)
+        return (u + beta) * 0.0 + 1.0
 
     def embed(self, beta: Scalar) -> Scalar:
         """Return 0: there is one value to tell apart."""
@@ -202,11 +207,11 @@ class CVaR(RiskMeasure):
     domain: ClassVar[Interval] = Interval(0.0, 1.0, low_inclusive=False)
     neutral_beta: ClassVar[float | None] = 1.0
 
-    def psi(self, tau: Tensor, beta: Tensor) -> Tensor:
+    def psi(self, tau: "Tensor", beta: "Tensor") -> "Tensor":
         """Return ``beta * tau``."""
         return beta * tau
 
-    def weight(self, u: Tensor, beta: Tensor) -> Tensor:
+    def weight(self, u: "Tensor", beta: "Tensor") -> "Tensor":
         """Return ``1 / beta`` below ``beta`` and 0 above."""
         return (u < beta) / beta
 
@@ -227,11 +232,11 @@ class PowerLaw(RiskMeasure):
     domain: ClassVar[Interval] = Interval(-2.0, 0.0)
     neutral_beta: ClassVar[float | None] = 0.0
 
-    def psi(self, tau: Tensor, beta: Tensor) -> Tensor:
+    def psi(self, tau: "Tensor", beta: "Tensor") -> "Tensor":
         """Return the power-law distortion; log1p and expm1 keep small ``tau`` exact."""
-        return -torch.expm1(torch.log1p(-tau) / (1.0 - beta))
+        return -((-tau).log1p() / (1.0 - beta)).expm1()
 
-    def weight(self, u: Tensor, beta: Tensor) -> Tensor:
+    def weight(self, u: "Tensor", beta: "Tensor") -> "Tensor":
         """Return ``(1 - beta) * (1 - u) ** -beta``."""
         return (1.0 - beta) * (1.0 - u) ** (-beta)
 
@@ -256,12 +261,16 @@ class Wang(RiskMeasure):
     domain: ClassVar[Interval] = Interval(-2.0, 2.0)
     neutral_beta: ClassVar[float | None] = 0.0
 
-    def psi(self, tau: Tensor, beta: Tensor) -> Tensor:
+    def psi(self, tau: "Tensor", beta: "Tensor") -> "Tensor":
         """Return the normal quantile of ``tau``, shifted by ``beta``, as a fraction again."""
+        import torch
+
         return torch.special.ndtr(torch.special.ndtri(tau) + beta)
 
-    def weight(self, u: Tensor, beta: Tensor) -> Tensor:
+    def weight(self, u: "Tensor", beta: "Tensor") -> "Tensor":
         """Return the likelihood ratio of the shifted normal."""
+        import torch
+
         return torch.exp(beta * torch.special.ndtri(u) - 0.5 * beta.square())
 
 
@@ -282,7 +291,7 @@ class CPW(RiskMeasure):
     domain: ClassVar[Interval] = Interval(0.3, 1.0)
     neutral_beta: ClassVar[float | None] = 1.0
 
-    def psi(self, tau: Tensor, beta: Tensor) -> Tensor:
+    def psi(self, tau: "Tensor", beta: "Tensor") -> "Tensor":
         """Return the inverse-S-shaped weighting of ``tau``."""
         weighted = tau**beta
         return weighted / (weighted + (1.0 - tau) ** beta) ** (1.0 / beta)
@@ -303,9 +312,9 @@ class VaR(RiskMeasure):
     domain: ClassVar[Interval] = Interval(0.0, 1.0, low_inclusive=False, high_inclusive=False)
     neutral_beta: ClassVar[float | None] = None
 
-    def psi(self, tau: Tensor, beta: Tensor) -> Tensor:
+    def psi(self, tau: "Tensor", beta: "Tensor") -> "Tensor":
         """Return ``beta``, broadcast against ``tau``."""
-        return beta + torch.zeros_like(tau)
+        return beta + 0.0 * tau
 
 
 #: Every measure by its name.

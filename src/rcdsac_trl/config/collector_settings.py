@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system.extras import needs
 from rcdsac_trl.system.processes import resolve_processes
 
 BY_TORCHRL = ("parallel_env", "single")
@@ -39,6 +40,15 @@ class CollectorSettings:
     def shares_evenly(self) -> bool:
         """Whether TorchRL puts the episodes together, which then must be as many from each process."""
         return self.name == "ray"
+
+    def check_package(self) -> None:
+        """Refuse a collector whose package is missing, in a training; other work on its run needs none.
+
+        Raises:
+            UserInputError: if it is.
+        """
+        if self.name == "ray":
+            needs("ray", "collector=ray", extra="ray", instead="collector=multi")
 
     def check_workers(self, num_workers: int | Literal["auto"]) -> None:
         """Refuse workers of a ``ParallelEnv`` where there is none, and a ``ParallelEnv`` without workers.

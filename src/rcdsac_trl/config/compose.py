@@ -1,8 +1,10 @@
 """Configs composed as the command line does, and the one sentence for whatever Hydra refuses."""
 
+import os
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -13,9 +15,12 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rcdsac_trl.config.command_line import key_of, several, unreadable
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.typed import unknown_key
-from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.errors import UserInputError, first_line
+
+_ABSENT = object()
 
 
 def output_folder(config_name: str, overrides: list[str]) -> Path:
@@ -29,7 +34,11 @@ def sweep_folder(config_name: str, overrides: list[str]) -> Path:
 
 
 def _folder(config_name: str, overrides: list[str], mode: str) -> Path:
-    folder = _compose(config_name, overrides, return_hydra_config=True).hydra[mode].dir
+    cfg = _compose(config_name, overrides, return_hydra_config=True)
+    try:
+        folder = cfg.hydra[mode].dir
+    except OmegaConfBaseException as error:
+        raise UserInputError(_not_resolved(error)) from error
     if not folder:
         raise UserInputError(f"hydra.{mode}.dir names no folder: give it one, or leave it out")
     return Path(folder)
@@ -53,16 +62,6 @@ def parse(overrides: list[str]) -> list[Override]:
         raise UserInputError(_sentence(error, "", overrides)) from error
 
 
-def key_of(override: str) -> str:
-    """Return the key that an override is about.
-
-    Example:
-        >>> key_of("+experiment=table"), key_of("learner.gamma=0.9")
-        ('experiment', 'learner.gamma')
-    """
-    return override.lstrip("+~").partition("=")[0]
-
-
 def compose(config_name: str, overrides: list[str]) -> DictConfig:
     """Compose a config as the command line does.
 
@@ -73,14 +72,24 @@ def compose(config_name: str, overrides: list[str]) -> DictConfig:
     try:
         OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
-        raise UserInputError(" ".join(str(error).split())) from error
+        raise UserInputError(_not_resolved(error)) from error
     return cfg
+
+
+def _not_resolved(error: OmegaConfBaseException) -> str:
+    key = re.search(r"full_key: (\S+)", str(error))
+    sentence = first_line(error) if key is None else f"{key[1]}: {first_line(error)}"
+    missing = re.search(r"Interpolation key '(\w+)' not found", sentence)
+    if missing is None or missing[1] not in os.environ:
+        return sentence
+    return f"{sentence}: write ${missing[1]}, without braces, for the variable of the environment"
 
 
 def _compose(config_name: str, overrides: list[str], *, return_hydra_config: bool = False) -> DictConfig:
     for override in overrides:
         if not key_of(override).partition("@")[0].strip():  # Hydra fails an assertion
-            raise UserInputError(f"{override} names no key: write it as <key>=<value>")
+            raise UserInputError(f"{override} names no key: write it as <key>=<value>, without spaces around =")
+    overrides = with_sections(config_name, overrides)
     # Inside a Hydra main the search path is set up already, and setting it up twice is an error.
     inside = GlobalHydra.instance().is_initialized()
     with nullcontext() if inside else hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
@@ -88,6 +97,31 @@ def _compose(config_name: str, overrides: list[str], *, return_hydra_config: boo
             return hydra.compose(config_name, overrides=overrides, return_hydra_config=return_hydra_config)
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise UserInputError(_sentence(error, config_name, overrides)) from error
+
+
+def with_sections(config_name: str, overrides: list[str]) -> list[str]:
+    """Let a key of a section that is null until it is chosen change that section, where the root takes a part of one.
+
+    `evaluate` completes ``task.episode_steps=200`` with the task that the agent was trained for; Hydra alone would want
+    a plus before it.
+
+    Example:
+        >>> with_sections("evaluate", ["run=a", "task.episode_steps=200"])
+        ['run=a', '+task.episode_steps=200']
+    """
+    if config_name != "evaluate":
+        return overrides
+    chosen = {key_of(override) for override in overrides}
+    absent = {group for group, option in _root_groups(config_name).items() if option is None} - chosen
+    return [f"+{o}" if o.partition(".")[0] in absent else o for o in overrides]
+
+
+def _root_groups(config_name: str) -> dict[str, str | None]:
+    """Return the groups in which a root takes a choice, and the option it takes if none is named."""
+    root: Any = OmegaConf.to_container(OmegaConf.load(CONF_DIR / f"{config_name}.yaml"))
+    entries = [entry for entry in root["defaults"] if isinstance(entry, dict)]
+    groups = {group: option for entry in entries for group, option in entry.items() if choices(group)}
+    return groups | ({"algo": None} if config_name == "train" else {})
 
 
 def choices(group: str) -> list[str]:
@@ -98,7 +132,7 @@ def choices(group: str) -> list[str]:
 def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     text = str(error)
     if isinstance(error, OverrideParseException):
-        return f"{error.override} cannot be read: write it as <key>=<value>, and lists in brackets"
+        return unreadable(error.override or "", overrides)
     if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']+)'", text):
         group, name = match.groups()
         known = choices(group)
@@ -110,20 +144,31 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     if config_name == "train" and any(override.startswith("algo=") for override in overrides):
         return f"write +algo=<name> (with a plus): one of {', '.join(choices('algo'))}"
     if match := re.match(r"Ambiguous value for argument '([^']+)'", text):
-        return f"{match[1]} holds several values: write a list in brackets, or add -m to run one job for each"
+        return several(match[1], as_jobs=config_name == "train")
     if match := re.match(r"Multiple values for (\S+)\.", text):
         return f"{match[1]} is chosen twice: write {match[1]}=<name> once, without a plus"
     if match := re.match(r"Could not override '([^']+)'", text):
-        return _no_key(match[1], _all_keys(config_name, overrides))
+        return _no_key(match[1], config_name, overrides)
     return " ".join(text.split())
 
 
-def _no_key(key: str, known: list[str]) -> str:
-    group = key.split(".")[0]
-    if group != key and group not in known and choices(group):
+def _no_key(key: str, config_name: str, overrides: list[str]) -> str:
+    """Say what to write in place of a key that a composed config does not have."""
+    known = _all_keys(config_name, overrides)
+    group, _, below = key.partition(".")
+    groups = _root_groups(config_name)
+    if below and group in groups:
         plus = "+" if group == "algo" else ""
-        return f"{key} needs a choice of {group}: add {plus}{group}=<name>, one of {', '.join(choices(group))}"
+        if groups[group] is None and group not in known:
+            return f"{key} needs a choice of {group}: add {plus}{group}=<name>, one of {', '.join(choices(group))}"
+        if having := [option for option in choices(group) if _option_has(group, option, below)]:
+            owners = " or ".join(f"{plus}{group}={option}" for option in having)
+            return f"{key} goes with {owners} alone: add that, or leave it out"
     return unknown_key(key, known)
+
+
+def _option_has(group: str, option: str, key: str) -> bool:
+    return OmegaConf.select(OmegaConf.load(CONF_DIR / group / f"{option}.yaml"), key, default=_ABSENT) is not _ABSENT
 
 
 def _all_keys(config_name: str, overrides: list[str]) -> list[str]:

@@ -1,9 +1,11 @@
 """What an evaluation, a calibration, an export or a publication may choose: the roots of their files in ``conf/``."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
-from rcdsac_trl.config.training_settings import SensorSettings, Threads, Workers
+from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
+from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
@@ -14,6 +16,8 @@ from rcdsac_trl.world.task.rules import TaskSettings
 Name = Literal["best", "last"] | int
 """How users name a checkpoint; a number: by the iterations that were done."""
 
+
+Section = TypeVar("Section", MapSettings, SensorSettings, TaskSettings)
 
 _MOST_FPS = 120
 
@@ -94,9 +98,10 @@ class EvaluationSettings:
     video: VideoSettings
     device: str
     threads: Threads
-    map: MapSettings | None = None
-    sensor: SensorSettings | None = None
-    task: TaskSettings | None = None
+    # What is not given here is as the agent was trained; see :meth:`world_of`.
+    map: Mapping[str, Any] | None = None
+    sensor: Mapping[str, Any] | None = None
+    task: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what is below its limit, and neither or both of run and baseline."""
@@ -123,7 +128,26 @@ class EvaluationSettings:
                     f"video.{key}={filmed} is not among the {number} evaluated: lower it, or raise num_{key}s"
                 )
         resolve_processes(self.num_workers, self.num_maps)
+        runtime.check_device_name(self.device)
         runtime.resolve_threads(self.threads)
+
+    def world_of(self, trained: TrainingSettings) -> tuple[MapSettings, SensorSettings, TaskSettings]:
+        """Return map set, sensor and task: those of a training, with what was chosen in their place.
+
+        Raises:
+            UserInputError: for a key or a value that they do not have.
+        """
+        return (
+            _changed(trained.map, self.map, "map"),
+            _changed(trained.sensor, self.sensor, "sensor"),
+            _changed(trained.task, self.task, "task"),
+        )
+
+
+def _changed(section: Section, values: Mapping[str, Any] | None, name: str) -> Section:
+    if not values:
+        return section
+    return read(type(section), {**vars(section), **values}, name)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.agent.networks import NetworkSettings
+from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
-from rcdsac_trl.config.compose import choices
+from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
@@ -44,8 +44,21 @@ def training_settings(cfg: DictConfig) -> TrainingSettings:
     return _training_settings(plain(cfg))
 
 
+def settings_of_new_run(cfg: DictConfig) -> TrainingSettings:
+    """Read the config of a training that is about to begin: what it asks for must be installed, too.
+
+    Raises:
+        UserInputError: as :func:`training_settings`, and for a logger or collector that cannot be had.
+    """
+    settings = training_settings(cfg)
+    settings.logger.check_backends()
+    settings.collector.check_package()
+    return settings
+
+
 def _training_settings(values: dict[str, Any]) -> TrainingSettings:
-    if values.get("algo") is None:
+    algo = values.get("algo")
+    if algo is None or (isinstance(algo, dict) and "name" not in algo):  # +algo.beta=-1 alone makes a section
         raise UserInputError(f"no algorithm chosen: add +algo=<name>, one of {', '.join(choices('algo'))}")
     return read(TrainingSettings, values)
 
@@ -81,6 +94,17 @@ def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
         UserInputError: if the folder holds no run, or one that this version cannot read.
     """
     return _of_run(folder, key, _training_settings)
+
+
+def settings_driven_by(run: Path | None) -> TrainingSettings:
+    """Read what the agent of a run was trained with; for None, a baseline, training's defaults.
+
+    Which agent would be trained in that default world does not matter.
+
+    Raises:
+        UserInputError: as :func:`settings_of_run`.
+    """
+    return training_settings(compose("train", ["+algo=sac"])) if run is None else settings_of_run(run)
 
 
 def _of_run(folder: Path, key: str, reader: Callable[[dict[str, Any]], Settings]) -> Settings:

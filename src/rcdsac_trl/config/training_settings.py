@@ -1,9 +1,10 @@
 """All that a training may choose, checked as a whole."""
 
+import importlib.util
 from dataclasses import dataclass
 from typing import Literal
 
-from rcdsac_trl.agent.networks import NetworkSettings
+from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
@@ -14,6 +15,9 @@ from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.world_settings import WorldSettings
+
+# Loggers whose package and extra are called as they are.
+_EXTRAS = ("wandb", "mlflow")
 
 Threads = int | Literal["auto"]
 Workers = int | Literal["auto"]
@@ -33,9 +37,23 @@ class SensorSettings:
 
 @dataclass(frozen=True)
 class LoggerSettings:
-    """Where scalars go (``conf/logger``); a training checks the names, an evaluation of it need not have them."""
+    """Where scalars go (``conf/logger``)."""
 
     backends: tuple[str, ...]
+
+    def check_backends(self) -> None:
+        """Refuse an unknown logger, or one whose package is missing, in a training; an evaluation of it needs none.
+
+        Raises:
+            UserInputError: naming the logger.
+        """
+        for backend in self.backends:
+            if backend not in (known := ("csv", "tensorboard", *_EXTRAS)):
+                raise UserInputError(f"logger.backends holds {backend!r}: choose among {', '.join(known)}")
+            if backend in _EXTRAS and importlib.util.find_spec(backend) is None:
+                raise UserInputError(
+                    f"logger {backend} is not installed: pip install 'rcdsac-trl[{backend}]', or use logger=default"
+                )
 
 
 @dataclass(frozen=True)
@@ -114,6 +132,7 @@ class TrainingSettings:
     def __post_init__(self) -> None:
         """Refuse what does not fit together, or not this machine."""
         check_least("seed", self.seed, 0)
+        runtime.check_device_name(self.device)
         runtime.resolve_threads(self.threads)
         self.collector.check_agents(self.world.num_agents)
         self.collector.check_workers(self.world.num_workers)

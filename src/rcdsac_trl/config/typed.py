@@ -7,6 +7,7 @@ from dataclasses import MISSING, Field, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from rcdsac_trl.config.command_line import quoted
 from rcdsac_trl.errors import UserInputError
 
 Settings = TypeVar("Settings")
@@ -22,7 +23,7 @@ def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> S
 
     Understood are ``bool``, ``int``, ``float`` (which takes whole numbers, and nothing infinite), ``str``,
     ``Literal``, ``None``, tuples (from lists), dataclasses (from sections), mappings from text (from sections with keys
-    of any name) and unions of these.
+    of any name; of ``Any``, what they hold is left to whoever reads it) and unions of these.
 
     Args:
         cls: a dataclass.
@@ -53,9 +54,31 @@ def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> S
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:
-    """Say that a key does not exist, and which one may have been meant."""
-    close = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
-    return f"there is no key {key}" + (f": did you mean {close[0]}?" if close else "")
+    """Say that a key does not exist, and which one may have been meant, else which ones its section has.
+
+    Example:
+        >>> unknown_key("lens.fokus_m", ["lens.focus_m", "seed"])
+        'there is no key lens.fokus_m: did you mean lens.focus_m?'
+        >>> unknown_key("lens.weight_kg", ["lens.focus_m", "seed"])
+        'there is no key lens.weight_kg: lens has focus_m'
+    """
+    known = list(known)
+    section, _, name = key.rpartition(".")
+    beside = {_name(other): other for other in known if other.rpartition(".")[0] == section}
+    named_so = [other for other in known if _name(other) == name]
+    if len(named_so) == 1:  # in another section
+        meant = named_so[0]
+    elif beside and (close := difflib.get_close_matches(name, beside, n=1, cutoff=0.6)):
+        meant = beside[close[0]]
+    elif not (beside and section) and (close := difflib.get_close_matches(key, known, n=1, cutoff=0.6)):
+        meant = close[0]
+    else:
+        return f"there is no key {key}" + (f": {section} has {', '.join(beside)}" if beside and section else "")
+    return f"there is no key {key}: did you mean {meant}?"
+
+
+def _name(key: str) -> str:
+    return key.rpartition(".")[2]
 
 
 def _join(section: str, key: str) -> str:
@@ -74,13 +97,16 @@ def _fit(value: Any, hint: Any, path: str) -> Any:
                 return read(option, value, path)
         elif get_origin(option) is Mapping:
             if isinstance(value, Mapping):
+                if get_args(option)[1] is Any:
+                    return dict(value)
                 each = get_args(option)[1]
                 return {str(key): _fit(below, each, _join(path, str(key))) for key, below in value.items()}
         elif _is_a(value, option):
             return tuple(value) if isinstance(value, list) else value
     wanted = " or ".join(_describe(option) for option in options)
     shown = "null" if value is None else value
-    raise UserInputError(f"{path}={shown} must be {wanted}")
+    as_text = f"; as a text: {quoted(path, str(shown))}" if str in options and isinstance(value, int | float) else ""
+    raise UserInputError(f"{path}={shown} must be {wanted}{as_text}")
 
 
 def _is_a(value: Any, hint: Any) -> bool:

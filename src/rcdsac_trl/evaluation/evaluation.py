@@ -9,10 +9,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings, Name
-from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_of_run, training_settings
+from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_driven_by
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.film.filming import write_film
@@ -46,7 +45,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     settings = read_config(cfg, EvaluationSettings)
     if settings.record:
         check_extra()
-    trained = _trained(settings)
+    trained = settings_driven_by(None if settings.run is None else Path(settings.run))
     spec = _spec(settings, trained)
     if settings.baseline is not None:
         check_baseline(settings.baseline, spec.world.sensor)
@@ -164,23 +163,16 @@ def _read_agent(trained: TrainingSettings, run: Path, checkpoint: Name) -> Agent
     return Agent(packed(average.module), packed_loss(loss))
 
 
-def _trained(settings: EvaluationSettings) -> TrainingSettings:
-    if settings.run is not None:
-        return settings_of_run(Path(settings.run))
-    # A baseline drives in training's default world; which agent would be trained there does not matter.
-    return training_settings(compose("train", ["+algo=sac"]))
-
-
 def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, num_conditions: int) -> WorldSettings:
-    sensor = settings.sensor or trained.sensor
+    maps, sensor, task = settings.world_of(trained)
     if settings.run is not None and sensor != trained.sensor:
         raise UserInputError(
             f"sensor={sensor.name} does not fit: {settings.run} was trained with sensor={trained.sensor.name}, "
             "leave it out"
         )
     return WorldSettings(
-        map_settings=settings.map or trained.map,
-        task=settings.task or trained.task,
+        map_settings=maps,
+        task=task,
         sensor=sensor.name,
         memory_s=sensor.memory_s,
         num_agents=settings.num_episodes * num_conditions,

@@ -13,9 +13,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rcdsac_trl.config.compose import compose, key_of, parse
+from rcdsac_trl.config.command_line import key_of
+from rcdsac_trl.config.compose import compose, parse
 from rcdsac_trl.config.experiment_settings import SearchSettings
-from rcdsac_trl.config.run_config import plain
+from rcdsac_trl.config.run_config import plain, settings_of_new_run
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.experiments.search_space import Searched, searched_in
@@ -23,7 +24,6 @@ from rcdsac_trl.experiments.sweep import Job, State, execute
 from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.tables import read_growing
-from rcdsac_trl.training.setup import check_training
 
 if TYPE_CHECKING:
     import optuna
@@ -55,12 +55,18 @@ def make_search(overrides: list[str]) -> "Search":
     if not searched:
         raise UserInputError("nothing is searched: choose space=<name>, or give a key a value such as interval(0,1)")
     fixed = [o for o in given.values() if not parse([o])[0].is_sweep_override()]
-    for end in ("low", "high"):
-        cfg = compose("train", [*fixed, *(f"{key}={getattr(kind, end)}" for key, kind in searched.items())])
-        check_training(cfg)
+    corners = [[f"{key}={getattr(kind, end)}" for key, kind in searched.items()] for end in ("low", "high")]
+    tried = [settings_of_new_run(compose("train", [*fixed, *corner])) for corner in corners]
     folder = Path("multirun") / f"search-{settings.name}"
-    trial = Job("", None, cfg.algo.name, cfg.sensor.name, cfg.seed, tuple(fixed), evaluate=None, folder=folder)
-    return Search(folder, settings, trial, searched)
+    one = tried[-1]
+    trial = Job("", None, one.algo.name, one.sensor.name, one.seed, tuple(fixed), evaluate=None, folder=folder)
+    search = Search(folder, settings, trial, searched)
+
+    from rcdsac_trl.training.setup import check_machine  # late: whatever needs no torch is told by then
+
+    for trained in tried:
+        check_machine(trained)
+    return search
 
 
 class Search:

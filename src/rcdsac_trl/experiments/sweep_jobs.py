@@ -7,15 +7,16 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.algo_settings import AlgoSettings
-from rcdsac_trl.config.compose import combinations, compose, key_of, parse, sweep_folder
+from rcdsac_trl.config.command_line import key_of
+from rcdsac_trl.config.compose import combinations, compose, parse, sweep_folder
 from rcdsac_trl.config.experiment_settings import ExperimentSettings
-from rcdsac_trl.config.run_config import plain, training_settings
+from rcdsac_trl.config.run_config import plain, settings_of_new_run
+from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.experiments.launchers import read_launcher
 from rcdsac_trl.experiments.sweep import Job, Sweep
 from rcdsac_trl.training.resume import differing_keys
-from rcdsac_trl.training.setup import check_training
 
 CONFIG = "sweep"
 _GROUPS = ("experiment", "launcher")
@@ -65,13 +66,19 @@ def make_sweep(overrides: list[str]) -> Sweep:
     launcher = read_launcher(values["launcher"])
     # As composed once: its default name is the time.
     folder = sweep_folder(CONFIG, [*own, f"experiment.name='{experiment.name}'"]).absolute()
-    jobs = list(_jobs(experiment, given, folder))
+    found = list(_jobs(experiment, given, folder))
+    jobs = [job for job, _ in found]
     _check_names(jobs)
+
+    from rcdsac_trl.training.setup import check_machine  # late: whatever needs no torch is told by then
+
+    for _, trained in found:
+        check_machine(trained)
     return Sweep(folder, experiment.name, jobs, launcher)
 
 
-def _jobs(experiment: ExperimentSettings, given: list[str], folder: Path) -> Iterator[Job]:
-    """Yield the jobs of an experiment, on top of whose runs come the overrides of the command line."""
+def _jobs(experiment: ExperimentSettings, given: list[str], folder: Path) -> Iterator[tuple[Job, TrainingSettings]]:
+    """Yield the jobs of an experiment, changed by the overrides of the command line, and what each trains with."""
     if experiment.only is not None and (unknown := set(experiment.only) - experiment.runs.keys()):
         raise UserInputError(
             f"experiment.only={sorted(unknown)[0]} is no run of the experiment: choose among "
@@ -105,26 +112,29 @@ def _merged(*layers: Iterable[str]) -> list[str]:
     return list(found.values())
 
 
-def _combined(experiment: ExperimentSettings, run: str | None, overrides: list[str], folder: Path) -> Iterator[Job]:
+def _combined(
+    experiment: ExperimentSettings, run: str | None, overrides: list[str], folder: Path
+) -> Iterator[tuple[Job, TrainingSettings]]:
     varied = {key_of(o.input_line or "") for o in parse(overrides) if o.is_sweep_override()}
-    for job in combinations(overrides):
-        cfg = compose("train", job)
-        check_training(cfg)
-        name = _name(run, cfg, [o for o in job if key_of(o) in varied and key_of(o) not in _NAMED])
+    for combination in combinations(overrides):
+        cfg = compose("train", combination)
+        settings = settings_of_new_run(cfg)
+        name = _name(run, cfg, [o for o in combination if key_of(o) in varied and key_of(o) not in _NAMED])
         if differing := differing_keys(folder / name, cfg):
             raise UserInputError(
                 f"{folder / name} holds a run of another config ({', '.join(differing[:3])}): choose another {_FOLDER}"
             )
-        yield Job(
+        job = Job(
             name=name,
             run=run,
             algo=cfg.algo.name,
             sensor=cfg.sensor.name,
             seed=cfg.seed,
-            overrides=tuple(job),
-            evaluate=_evaluate(experiment, training_settings(cfg).algo),
+            overrides=tuple(combination),
+            evaluate=_evaluate(experiment, settings.algo),
             folder=folder / name,
         )
+        yield job, settings
 
 
 def _name(run: str | None, cfg: DictConfig, varied: Iterable[str]) -> str:

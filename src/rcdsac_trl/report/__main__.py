@@ -6,9 +6,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from rcdsac_trl.cli import Command
-from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.read import Episodes, read_episodes
-from rcdsac_trl.system.resources import check_writable
+from rcdsac_trl.system.resources import check_out
 
 
 @dataclass(frozen=True)
@@ -35,9 +34,7 @@ def make_report(cfg: DictConfig) -> Report:
     named = [runs] if isinstance(runs, str) else list(runs or [])
     folders = [Path(str(run)) for run in named]
     out = Path(str(cfg.out))
-    if out.exists() and not out.is_dir():
-        raise UserInputError(f"out={out} is not a folder: give another with out=<folder>")
-    check_writable(out)
+    check_out(out)
     return Report(read_episodes(folders), folders, out)
 
 

@@ -29,7 +29,6 @@ from rcdsac_trl.rollout.worker_processes import (
 )
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.cores import usable_cores
-from rcdsac_trl.system.extras import needs
 from rcdsac_trl.system.processes import largest_divisor, resolve_num_workers, resolve_processes
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.task.spaces import agent_observations
@@ -49,16 +48,6 @@ def make_episodes(
         progress: what is done already.
     """
     return _COLLECTORS[settings.collector.name](settings, actor, device, progress)
-
-
-def check_collector(settings: TrainingSettings) -> None:
-    """Refuse a collector whose package is missing.
-
-    Raises:
-        UserInputError: if it is.
-    """
-    if settings.collector.name == "ray":
-        needs("ray", "collector=ray", extra="ray", instead="collector=multi")
 
 
 def _multi(

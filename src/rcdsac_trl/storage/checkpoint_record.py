@@ -15,8 +15,8 @@ from typing import Any
 from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage import atomic as durable
-from rcdsac_trl.storage import replay_files
-from rcdsac_trl.storage.replay_files import Segment
+from rcdsac_trl.storage import replay_segments
+from rcdsac_trl.storage.replay_segments import Segment
 
 FORMAT_VERSION = 1
 _RECORD = "checkpoint.json"
@@ -89,7 +89,7 @@ def newest(folder: Path, *, replay: Path | None = None) -> tuple[Saved, list[str
     for path in reversed(folders(folder)):
         try:
             saved = checked(path)
-            if replay is not None and (reason := replay_files.damage(replay, saved.segments)) is not None:
+            if replay is not None and (reason := replay_segments.damage(replay, saved.segments)) is not None:
                 raise DamagedError(reason)
             return saved, damaged
         except DamagedError as error:

@@ -1,7 +1,6 @@
 """The replay on disk: every episode is written once, into a file that never changes."""
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
@@ -10,28 +9,7 @@ from tensordict import TensorDict
 
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.storage.replay import SequenceReplay
-
-
-@dataclass(frozen=True)
-class Segment:
-    """One file of consecutive episodes.
-
-    Attributes:
-        file: its name in the folder.
-        sha256: of its content.
-        first_episode: number of its first episode, counted from 0 as the replay does.
-        episodes: how many it holds.
-    """
-
-    file: str
-    sha256: str
-    first_episode: int
-    episodes: int
-
-    @property
-    def end(self) -> int:
-        """Number of the first episode behind it."""
-        return self.first_episode + self.episodes
+from rcdsac_trl.storage.replay_segments import Segment
 
 
 class ReplayFiles:
@@ -70,7 +48,7 @@ class ReplayFiles:
         return Segment(file, sha256(content).hexdigest(), first, episodes)
 
     def load(self, segments: Sequence[Segment]) -> None:
-        """Fill the empty replay with segments that :func:`damage` found whole."""
+        """Fill the empty replay with segments that :func:`~rcdsac_trl.storage.replay_segments.damage` found whole."""
         if not segments:
             return
         oldest = max(segments[0].first_episode, segments[-1].end - self.replay.capacity_episodes)
@@ -89,11 +67,3 @@ def remove_others(folder: Path, kept: Collection[str]) -> None:
     for path in folder.glob("*.safetensors"):
         if path.name not in kept:
             path.unlink()
-
-
-def damage(folder: Path, segments: Sequence[Segment]) -> str | None:
-    """Say what is wrong with the files of some segments; None if they are whole."""
-    for segment in segments:
-        if (reason := atomic.damage(folder / segment.file, segment.sha256)) is not None:
-            return f"{folder / segment.file} {reason}"
-    return None

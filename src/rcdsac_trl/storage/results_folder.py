@@ -1,14 +1,13 @@
 """A folder of results: tables, and a file that says what they are of."""
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage import atomic
-from rcdsac_trl.system.resources import check_writable
+from rcdsac_trl.system.resources import check_out
 
 
 class ResultsFolder:
@@ -44,9 +43,7 @@ class ResultsFolder:
         atomic.write(self._description, self.described.encode())
 
     def _check(self) -> None:
-        if os.path.exists(self.path) and not self.path.is_dir():
-            raise UserInputError(f"out={self.path} is not a folder: give another with out=<folder>")
-        check_writable(self.path)
+        check_out(self.path)
         if self._description.exists() and self._holds_another():
             kind = self._description.stem
             raise UserInputError(

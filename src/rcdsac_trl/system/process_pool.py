@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
 from rcdsac_trl.system.interrupts import interruption_point
-from rcdsac_trl.system.processes import START_METHOD, WorkerError, ending
+from rcdsac_trl.system.processes import START_METHOD, WorkerError, check_may_start_processes, ending
 
 Serve = Callable[[Any, Callable[[], None]], Any]
 """Answers a request; calls its second argument before every step, which shows that it does not hang."""
@@ -49,11 +49,13 @@ class ProcessPool:
 
     Raises:
         WorkerError: if a process cannot be started.
+        UserInputError: if this process may start none.
     """
 
     def __init__(
         self, makes: Sequence[MakeServe], names: Sequence[str], *, module: str, timeout_s: float | None
     ) -> None:
+        check_may_start_processes()
         self.processes: list[Any] = []
         self._names = names
         self._timeout_s = timeout_s

@@ -19,6 +19,20 @@ class WorkerError(FaultError):
     """
 
 
+def check_may_start_processes() -> None:
+    """Refuse to start processes where multiprocessing would fail an assertion.
+
+    Raises:
+        UserInputError: in a daemonic process, with what to do.
+    """
+    if multiprocessing.current_process().daemon:
+        raise UserInputError(
+            "this is a daemonic process, as those of multiprocessing.Pool are, and may start no processes: use "
+            "concurrent.futures.ProcessPoolExecutor instead, or let this one drive alone, with num_workers=0, in a "
+            "training collector.num_processes=0 validation.processes=0"
+        )
+
+
 def ending(code: int | None) -> str:
     """Say how a process ended that has an exit code."""
     if code is not None and code < 0:

@@ -4,6 +4,7 @@ Nothing here imports torch: entry points read it before they know that their inp
 """
 
 import errno
+import os
 import shutil
 import tempfile
 from contextlib import suppress
@@ -72,6 +73,17 @@ def check_writable(folder: Path) -> None:
         raise UserInputError(
             f"nothing can be written into {existing} ({error.strerror}): choose a folder elsewhere than {folder}"
         ) from error
+
+
+def check_out(folder: Path) -> None:
+    """Refuse what cannot be the folder ``out`` of some results.
+
+    Raises:
+        UserInputError: naming it.
+    """
+    if os.path.exists(folder) and not folder.is_dir():  # false for a name that is too long, which is told below
+        raise UserInputError(f"out={folder} is not a folder: give another with out=<folder>")
+    check_writable(folder)
 
 
 def check_picture(out: Path) -> None:

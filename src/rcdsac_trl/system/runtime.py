@@ -96,15 +96,24 @@ def resolve_device(name: str) -> str:
     Raises:
         UserInputError: if the named device is not on this machine.
     """
+    check_device_name(name)
     import torch
 
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
-        raise UserInputError(f"device={name} is not supported: use auto, cpu, cuda or cuda:<number>")
     if name != "cpu" and (torch.device(name).index or 0) >= torch.cuda.device_count():
         raise UserInputError(f"device={name}, but torch does not see it here: use device=auto or device=cpu")
     return name
+
+
+def check_device_name(name: str) -> None:
+    """Refuse what names no device; whether it is there only torch knows.
+
+    Raises:
+        UserInputError: naming those that there are.
+    """
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
+        raise UserInputError(f"device={name} is not supported: use auto, cpu, cuda or cuda:<number>")
 
 
 def resolve_threads(threads: int | str) -> int:

@@ -8,12 +8,12 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.config.compose import compose, key_of, output_folder
-from rcdsac_trl.config.run_config import CHECKPOINTS, CONFIG_NAME, settings_of_run
+from rcdsac_trl.config.command_line import folder_of, key_of
+from rcdsac_trl.config.compose import compose, output_folder
+from rcdsac_trl.config.run_config import CHECKPOINTS, CONFIG_NAME, settings_of_new_run, settings_of_run
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage.checkpoint_record import newest
-from rcdsac_trl.training.run_log import MANIFEST_NAME
-from rcdsac_trl.training.setup import check_training, has_begun
+from rcdsac_trl.training.run_folder import MANIFEST_NAME, has_begun
 
 AUTO = "auto"
 _ABSENT = object()
@@ -40,7 +40,7 @@ def run_to_continue(overrides: list[str]) -> Path | None:
     if cfg.resume == "":
         raise UserInputError("resume names no folder: give it one, or auto, or leave it out")
     if cfg.resume == AUTO:
-        check_training(cfg)
+        settings_of_new_run(cfg)
         return _newest_unfinished(overrides)
     folder = Path(str(cfg.resume))
     settings_of_run(folder, key="resume")
@@ -93,7 +93,7 @@ def _check_overrides(folder: Path, overrides: list[str]) -> None:
         key = key_of(override)
         if override in own or key == "resume":
             continue
-        if key == "hydra.run.dir" and Path(override.partition("=")[2]).resolve() == folder.resolve():
+        if key == "hydra.run.dir" and folder_of(override).resolve() == folder.resolve():
             continue
         if key.startswith("hydra") or _changes(own, override):
             raise UserInputError(

@@ -14,12 +14,12 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.agent.kernels import matmul
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
 from rcdsac_trl.agent.transforms import Mirror
-from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_run, training_settings
+from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_new_run, settings_of_run
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, make_optimizer, make_relabel, packed, parameters
-from rcdsac_trl.rollout.make_collector import check_collector, make_episodes
+from rcdsac_trl.rollout.make_collector import make_episodes
 from rcdsac_trl.rollout.map_evaluator import EvaluationSpec, map_evaluator
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint import Checkpoints, Generators, load_average, rotate
@@ -28,11 +28,12 @@ from rcdsac_trl.storage.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.storage.replay_files import ReplayFiles
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.cores import usable_cores
-from rcdsac_trl.system.processes import resolve_processes_beside
-from rcdsac_trl.training import run_log
+from rcdsac_trl.system.processes import check_may_start_processes, resolve_processes, resolve_processes_beside
 from rcdsac_trl.training.learner import Learner
 from rcdsac_trl.training.nan_guard import FiniteGuard, load_failure
 from rcdsac_trl.training.restart_budget import RestartBudget
+from rcdsac_trl.training.run_folder import check_folder, cut, has_begun, start_run_folder
+from rcdsac_trl.training.run_log import RunLog
 from rcdsac_trl.training.trainer import IterationHook, Trainer, saved_sentence
 from rcdsac_trl.training.validation import Snapshot, SnapshotEvaluator, Validation
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
@@ -58,12 +59,29 @@ def check_training(cfg: DictConfig) -> TrainingSettings:
     Raises:
         UserInputError: for whatever cannot work, or not on this machine.
     """
-    settings = training_settings(cfg)
-    runtime.resolve_device(settings.device)
-    run_log.check_backends(settings.logger.backends)
-    check_collector(settings)
-    _check_memory(settings)
+    settings = settings_of_new_run(cfg)
+    check_machine(settings)
     return settings
+
+
+def check_machine(settings: TrainingSettings) -> None:
+    """Refuse what cannot be done here: there is no such device, too little memory, or no leave to start processes.
+
+    Raises:
+        UserInputError: naming what there is.
+    """
+    runtime.resolve_device(settings.device)
+    _check_processes(settings)
+    _check_memory(settings)
+
+
+def _check_processes(settings: TrainingSettings) -> None:
+    """Refuse processes where none may be started, those of validation before hours of training too."""
+    threads = runtime.resolve_threads(settings.threads)
+    of_validation = resolve_processes_beside(settings.validation.processes, settings.validation.num_maps, threads)
+    collecting = resolve_processes(settings.collector.num_processes, settings.world.num_agents)
+    if of_validation or collecting or settings.training_world.num_workers:
+        check_may_start_processes()
 
 
 def _check_memory(settings: TrainingSettings) -> None:
@@ -146,12 +164,12 @@ def make_trainer(
         "allocator": runtime.allocator(),
         "matrix_products": matmul.LIBRARY,
     }
-    run_log.check_folder(folder)
+    check_folder(folder)
     learner = _learner_here(settings)  # before anything is written: it may not fit into the memory
     folder.mkdir(parents=True, exist_ok=True)
     lock = FolderLock(folder)
     try:
-        run_log.start_run_folder(folder, cfg, facts)
+        start_run_folder(folder, cfg, facts)
         return _assemble(settings, learner, folder, lock, None, [], on_iteration_end)
     except BaseException:
         lock.close()
@@ -166,7 +184,8 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
     """
     settings = settings_of_run(folder, key="resume")
     resources.check_writable(folder)
-    check_collector(settings)
+    settings.collector.check_package()
+    _check_processes(settings)
     _check_memory(settings)
     lock = FolderLock(folder)
     try:
@@ -192,11 +211,6 @@ def reproduce_failure(dump: Path) -> tuple[LossModule, TensorDict]:
     loss = make_loss(settings, "cpu")
     SoftUpdate(loss, tau=settings.learner.target_coefficient)  # TorchRL warns of targets that nothing moves
     return loss, load_failure(dump, loss)
-
-
-def has_begun(folder: Path) -> bool:
-    """Whether a run has saved or driven anything; one that has not can only be begun."""
-    return (folder / run_log.TRAINING_TABLE).exists() or any((folder / CHECKPOINTS).glob("[!.]*"))
 
 
 def _learner_here(settings: TrainingSettings) -> Learner:
@@ -242,7 +256,7 @@ def _assemble(
             *left_out,
             f"continue after {progress.iterations} of {total} iterations, from {saved.path}",
         ]
-    log = run_log.RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
+    log = RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
     active = f"allocator: {runtime.allocator()}, matrix products by {matmul.LIBRARY} BLAS"
     for sentence in [*messages, f"device {device}, {threads} threads, {active}"]:
         log.message(sentence)
@@ -279,7 +293,7 @@ def _assemble(
 def _restore(folder: Path, checkpoints: Checkpoints, saved: Saved) -> tuple[Progress, list[str]]:
     """Bring components and logs back to a checkpoint; return the progress, and what the user should know."""
     checkpoints.restore(saved)
-    messages = run_log.cut(folder, saved.logs)
+    messages = cut(folder, saved.logs)
     damage = best_damage(checkpoints.folder, saved.progress)
     if damage is None:
         return saved.progress, messages

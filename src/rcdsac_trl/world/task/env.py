@@ -13,7 +13,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.system.processes import START_METHOD, resolve_num_workers
+from rcdsac_trl.system.processes import START_METHOD, check_may_start_processes, resolve_num_workers
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
@@ -253,6 +253,7 @@ def make_env(
     ]
     if serial:
         return SerialEnv(workers, NavigationEnv, create_env_kwargs=kwargs)
+    check_may_start_processes()
     multiprocessing.set_forkserver_preload([__name__])
     env = ParallelEnv(
         workers,

@@ -1,0 +1,56 @@
+"""What may be chosen about the networks; without torch, so that a mistake in it is told at once."""
+
+from dataclasses import dataclass
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import RangeCode
+from rcdsac_trl.robot.ring import Padding
+from rcdsac_trl.system.checks import one_of
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Layers of encoders and heads; the defaults are the paper's as far as it states them.
+
+    Args:
+        conv: channels of both convolutions.
+        range: features of the range observation.
+        vector: features of each vector observation.
+        memory: size of the recurrent state.
+        head: size of every fully-connected layer after the recurrent one, and of the risk gates.
+        cosines: number of cosine features of ``beta`` and of a quantile fraction.
+        padding: how the convolutions read the ring of range bins; see :mod:`rcdsac_trl.robot.ring`.
+        range_code: how they read a bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
+        encoder: an encoder of yours as ``package.module.Class``; see
+            :class:`~rcdsac_trl.agent.networks.HistoryEncoder`. None for :class:`~rcdsac_trl.agent.networks.Encoder`.
+
+    Raises:
+        UserInputError: if a width is below 1, or there is no such padding, code or encoder.
+    """
+
+    conv: int = 32
+    range: int = 128
+    vector: int = 32
+    memory: int = 128
+    head: int = 128
+    cosines: int = 64
+    padding: Padding = "circular"
+    range_code: RangeCode = "paper"
+    encoder: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse widths below 1, other readings of the bins, and an encoder that cannot be imported."""
+        for name, width in self.widths.items():
+            if width < 1:
+                raise UserInputError(f"network width {name} = {width} is below 1: give a positive integer")
+        one_of("network.padding", self.padding, Padding)
+        one_of("network.range_code", self.range_code, RangeCode)
+        if self.encoder is not None:
+            from rcdsac_trl.agent.networks import imported_encoder  # late, since it imports torch
+
+            imported_encoder(self.encoder)
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """The sizes of the layers, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, int)}

@@ -1,0 +1,103 @@
+"""Overrides before Hydra reads them: what a shell would have expanded, and what to write where Hydra misreads them."""
+
+import os
+import re
+import shlex
+from pathlib import Path
+
+from rcdsac_trl.errors import UserInputError
+
+# Where a path may begin in a value is behind the key, in a list, behind a quote; a variable may be any part of it.
+_HOME = re.compile(r"""(?<=[=\[,'"])~(?P<user>[\w.-]*)(?=[/,\]'"]|$)""")
+_VARIABLE = re.compile(r"""(?<=[=\[,'"/])\$(?P<name>[A-Za-z_]\w*)""")
+
+
+def key_of(override: str) -> str:
+    """Return the key that an override is about.
+
+    Example:
+        >>> key_of("+experiment=table"), key_of("learner.gamma=0.9")
+        ('experiment', 'learner.gamma')
+    """
+    return override.lstrip("+~").partition("=")[0]
+
+
+def expanded(override: str) -> str:
+    """Put home folders and variables of the environment into a value, which no shell does behind a key.
+
+    Raises:
+        UserInputError: for a user or a variable that does not exist: the folder would be called as it is written.
+
+    Example:
+        >>> expanded("out=~/x") == expanded("out=$HOME/x"), expanded("~learner.gamma")
+        (True, '~learner.gamma')
+    """
+    with_home = _HOME.sub(lambda found: _home(override, found), override)
+    return _VARIABLE.sub(lambda found: _variable(override, found), with_home)
+
+
+def _home(override: str, found: re.Match[str]) -> str:
+    home = os.path.expanduser(found[0])
+    if home == found[0]:
+        raise UserInputError(f"{override}: there is no home folder {found[0]}: write the path in full")
+    return _within(found, home)
+
+
+def _variable(override: str, found: re.Match[str]) -> str:
+    if found["name"] not in os.environ:
+        raise UserInputError(f"{override}: there is no environment variable {found['name']}: write its value")
+    return _within(found, os.environ[found["name"]])
+
+
+def _within(found: re.Match[str], text: str) -> str:
+    """Return a text as Hydra must be given it in place of what was found: what is no plain path needs quotes there."""
+    before = found.string[: found.start()]
+    is_quoted = before.count("'") % 2 or before.count('"') % 2
+    return text if is_quoted else re.sub(r"([^\w/.+%@-])", r"\\\1", text)
+
+
+def quoted(key: str, value: str) -> str:
+    r"""Write an override so that a shell and Hydra leave its value as it is.
+
+    Example:
+        >>> print(quoted("out", "a,b"))
+        'out="a,b"'
+    """
+    escaped = value.strip("'\"").replace('"', '\\"')
+    return shlex.quote(f'{key}="{escaped}"')
+
+
+def unreadable(override: str, overrides: list[str]) -> str:
+    """Say what to write in place of an override that Hydra's grammar does not take."""
+    key, equals, value = override.partition("=")
+    sentence = f"{override} cannot be read: write it as <key>=<value>"
+    number = overrides.index(override) if override in overrides else 0
+    if not equals:
+        if number and "=" in (before := overrides[number - 1]):  # a shell has split a value at its space
+            start, _, text = before.partition("=")
+            return f"{sentence}, or, if it belongs to what stands before it, {quoted(start, f'{text} {override}')}"
+        return sentence
+    return f"{sentence}, lists in brackets, and a text with characters such as , = ( [ as {quoted(key, value)}"
+
+
+def several(override: str, *, as_jobs: bool) -> str:
+    """Say what to write in place of an override with a comma in its value.
+
+    Args:
+        override: the override.
+        as_jobs: whether the verb can do one job for each of the values.
+    """
+    key, _, value = override.partition("=")
+    jobs = ", or add -m to run one job for each" if as_jobs else ""
+    text = quoted(key, value)
+    return f"{override} holds several values: write a list in brackets{jobs}, or a text with commas as {text}"
+
+
+def folder_of(override: str) -> Path:
+    """Return the folder that an override names, with or without quotes.
+
+    Example:
+        >>> folder_of("hydra.run.dir='runs/a'").as_posix()
+        'runs/a'
+    """
+    return Path(override.partition("=")[2].strip("'\""))

@@ -1,0 +1,91 @@
+"""What is wrong with a call that can be told without torch: each verb looks here before it imports what it works with.
+
+Whoever makes the verb's object reads the same settings again, and refuses what shows only then.
+"""
+
+import os
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from rcdsac_trl.config.course_settings import CourseSettings
+from rcdsac_trl.config.evaluation_settings import (
+    CalibrationSettings,
+    EvaluationSettings,
+    ExportSettings,
+    PublishSettings,
+)
+from rcdsac_trl.config.run_config import agent_of_run, read_config, settings_driven_by, settings_of_run
+from rcdsac_trl.deploy import find_weights
+from rcdsac_trl.system.resources import check_out, check_writable
+from rcdsac_trl.world.task.world_settings import WorldSettings
+
+
+def look_at_evaluation(cfg: DictConfig) -> None:
+    """Refuse settings, a run and values of beta that `evaluate` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, EvaluationSettings)
+    trained = settings_driven_by(None if settings.run is None else Path(settings.run))
+    if settings.run is not None:
+        trained.algo.conditions(settings.beta, settings.collision_weight)
+    maps, sensor, task = settings.world_of(trained)
+    WorldSettings(maps, task, sensor.name)
+    _look_at_out(settings.out)
+
+
+def look_at_calibration(cfg: DictConfig) -> None:
+    """Refuse settings and a run that `calibrate` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, CalibrationSettings)
+    if settings.run is not None:
+        settings_of_run(Path(settings.run))
+    _look_at_out(settings.out)
+
+
+def look_at_course(cfg: DictConfig) -> None:
+    """Refuse settings and names that `course` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, CourseSettings)
+    for run in settings.runs:
+        if not os.path.exists(run):  # then it can only be the name of a shipped agent
+            find_weights(run)
+    _look_at_out(settings.out)
+
+
+def look_at_export(cfg: DictConfig) -> None:
+    """Refuse settings and a run that `export` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, ExportSettings)
+    if settings.run is not None:
+        agent_of_run(Path(settings.run))
+    _look_at_out(settings.out)
+
+
+def look_at_publication(cfg: DictConfig) -> None:
+    """Refuse settings and runs that `publish` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, PublishSettings)
+    for run in settings.runs:
+        agent_of_run(Path(run))
+    for folder in (settings.weights, settings.results):
+        check_writable(Path(folder))
+
+
+def _look_at_out(out: str | None) -> None:
+    if out is not None:
+        check_out(Path(out))
