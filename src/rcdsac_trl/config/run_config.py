@@ -22,6 +22,8 @@ CONFIG_NAME = "config.yaml"
 """What makes a folder a run folder."""
 CHECKPOINTS = "checkpoints"
 """The folder of a run's checkpoints, in the run folder."""
+TRAINING_NAME = "training.yaml"
+"""The config of an exported agent's training, in its folder."""
 
 Settings = TypeVar("Settings")
 
@@ -83,10 +85,29 @@ def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
     return _of_run(folder, key, _training_settings)
 
 
+def settings_of_export(folder: Path) -> TrainingSettings:
+    """Read what an exported agent was trained with.
+
+    Raises:
+        UserInputError: if its folder does not say so, or this version cannot read it.
+    """
+    path = folder / TRAINING_NAME
+    if not path.is_file():
+        raise UserInputError(
+            f"{folder} holds no {TRAINING_NAME}, so nobody knows the world its agent was trained in: export it anew "
+            "with this version, or name its run folder"
+        )
+    return _of_file(path, _training_settings)
+
+
 def _of_run(folder: Path, key: str, reader: Callable[[dict[str, Any]], Settings]) -> Settings:
     path = folder / CONFIG_NAME
     if not os.path.isfile(path):  # false for a name that is too long, too
         raise UserInputError(f"{key}={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
+    return _of_file(path, reader)
+
+
+def _of_file(path: Path, reader: Callable[[dict[str, Any]], Settings]) -> Settings:
     try:
         cfg = OmegaConf.load(path)
         if not isinstance(cfg, DictConfig):

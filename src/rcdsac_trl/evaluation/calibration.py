@@ -1,7 +1,6 @@
 """Calibration: are the quantiles that critics have learnt true? Predictions against the returns of roll-outs."""
 
 import contextlib
-import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,19 +11,19 @@ from omegaconf import DictConfig
 
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import CalibrationSettings
-from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_of_run
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import measure_states
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
+from rcdsac_trl.release.named_agent import NamedAgent, named_agent
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
-from rcdsac_trl.rollout.make_agent import make_loss, packed_loss, unpacked_loss
+from rcdsac_trl.rollout.make_agent import packed_loss, unpacked_loss
 from rcdsac_trl.seeding import stream, torch_stream
-from rcdsac_trl.storage.checkpoint import load_weights
-from rcdsac_trl.storage.checkpoint_record import find
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.task.rules import RULES_VERSION
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -41,12 +40,15 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is None:
-        raise UserInputError("name the run whose critics are measured: run=<folder>")
-    folder = Path(settings.run)
-    trained = settings_of_run(folder)
+        raise UserInputError(
+            "name the agent whose critics are measured: run=<folder> of a run or an export, or a shipped agent"
+        )
+    named = named_agent(settings.run, settings.checkpoint)
+    trained = named.settings
     if trained.algo.critic != "quantile":
         raise UserInputError(
-            f"run={folder} has {trained.algo.critic} critics, which predict no quantiles: name a run of another row"
+            f"run={settings.run} has {trained.algo.critic} critics, which predict no quantiles: name an agent of "
+            "another row"
         )
     if not 0 < settings.horizon_steps < trained.task.episode_steps:
         raise UserInputError(
@@ -54,42 +56,43 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
             "episode, so that states can be met in it: shorten it"
         )
     conditions = trained.algo.conditions(settings.beta, None)
-    checkpoints = folder / CHECKPOINTS
-    find(checkpoints, settings.checkpoint)
+    named.check()
+    loss = named.load_critics()
+    processes = resolve_processes(settings.num_workers, settings.num_maps)
 
-    def maps() -> Generator[Rows, None, None]:
-        loss = make_loss(trained, "cpu")
-        for damaged in load_weights(checkpoints, settings.checkpoint, loss=loss):
-            print(f"rcdsac_trl: {damaged}", file=sys.stderr)
+    def maps(watch: Watch) -> Generator[Rows, None, None]:
         make = partial(_driver, settings, trained, conditions, packed_loss(loss))
-        return evaluate_maps(make, settings.num_maps, resolve_processes(settings.num_workers, settings.num_maps))
+        return evaluate_maps(make, settings.num_maps, processes, watch)
 
     return MeasuredRun(
         kind="calibration",
-        out=_default_out(settings, folder, conditions) if settings.out is None else Path(settings.out),
-        described=_described(settings, trained, conditions),
+        out=_default_out(settings, named, conditions) if settings.out is None else Path(settings.out),
+        described=_described(settings, named, conditions),
         unit="map",
         num_units=settings.num_maps,
+        unit_steps=trained.task.episode_steps,
+        processes=processes,
         measure=maps,
         findings=_findings,
     )
 
 
-def _default_out(settings: CalibrationSettings, run: Path, conditions: Sequence[Condition]) -> Path:
-    name = f"{settings.checkpoint}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
-    return run / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
+def _default_out(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition]) -> Path:
+    name = f"{named.stem}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}".removeprefix(
+        "-"
+    )
+    return named.out / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
 
 
-def _described(
-    settings: CalibrationSettings, trained: TrainingSettings, conditions: Sequence[Condition]
-) -> dict[str, Any]:
+def _described(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition]) -> dict[str, Any]:
     """Say what is measured and how."""
+    trained = named.settings
     return {
         "agent": trained.algo.name,
         "measure": trained.algo.distortion.name,
         "sensor": trained.sensor.name,
         "train_seed": trained.seed,
-        "checkpoint": settings.checkpoint,
+        **named.described,
         "split": settings.split,
         "seed": settings.seed,
         "num_maps": settings.num_maps,
