@@ -221,13 +221,14 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
 
 # ------------------------------------------------------------------------------------------------ evaluate
 RUN = "run=<the tiny run>"
+EITHER = "name what to evaluate: either run=<folder or shipped agent>"
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ([], "name what to evaluate: either run=<folder or shipped agent> or baseline=<name>, such as mppi"),
-        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder or shipped agent> or baseline=<name>, such as mppi"),
+        ([], f"{EITHER} or baseline=<name>, such as mppi"),
+        ([RUN, "baseline=pursuit"], f"{EITHER} or baseline=<name>, such as mppi"),
         (["run=nowhere"], "there is no agent 'nowhere': shipped are "),
         (["run=123"], "run=123 must be text or null"),
         ([RUN], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),

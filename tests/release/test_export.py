@@ -24,7 +24,8 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
 torch.set_num_threads(1)
-FILES = {"README.md", "weights.safetensors", "actor.onnx", "actor.pt2", "config.json", "critics.onnx", "critics.pt2", "training.yaml"}
+PROGRAMS = {"actor.onnx", "actor.pt2", "critics.onnx", "critics.pt2"}
+FILES = PROGRAMS | {"README.md", "config.json", "training.yaml", "weights.safetensors"}
 
 
 @pytest.mark.slow

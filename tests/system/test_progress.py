@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -11,7 +11,7 @@ from rcdsac_trl.system.progress import Work, duration, never_silent
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], None]]:
+def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Time that passes when it is told to."""
     now_s = 100.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now_s)
@@ -20,7 +20,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], None]]:
         nonlocal now_s
         now_s += seconds
 
-    yield wait
+    return wait
 
 
 def test_the_rest_is_guessed_by_the_pace_since_the_first_part(

@@ -10,7 +10,7 @@ from typing import Any
 from rcdsac_trl.rollout.evaluation_pool import Rows
 from rcdsac_trl.storage.results_folder import UNFINISHED, ResultsFolder
 from rcdsac_trl.system.interrupts import at_safe_points
-from rcdsac_trl.system.progress import Watch, Work
+from rcdsac_trl.system.progress import Watch, Work, counted
 
 
 @dataclass(frozen=True)
@@ -95,21 +95,23 @@ class MeasuredRun:
     def _measured(self) -> Rows:
         """Measure all units, and keep the tables of those that have ended."""
         rows: Rows = []
+        kept = 0
+        units = counted(self._num_units, self._unit)
         where = f" in {self._processes} processes" if self._processes else ""
-        doing = f"{self._num_units} {self._unit}s{where}, for {self.results.path}"
-        with Work(doing, self._num_units, self._unit) as work, at_safe_points():
+        with Work(f"{units}{where}, for {self.results.path}", self._num_units, self._unit) as work, at_safe_points():
             if (left := self.results.left_unfinished()) is not None:
-                _say(f"an earlier call ended after {left[0]} of {left[1]} {self._unit}s: all are measured anew")
+                _say(f"an earlier call ended after {left[0]} of {counted(left[1], self._unit)}: all are measured anew")
             try:
                 # Closed here and now where Ctrl-C comes between two units, and with it the processes that measure.
-                with contextlib.closing(self.measure(lambda steps: work.reach(steps / self._unit_steps))) as units:
-                    for of_unit in units:
+                with contextlib.closing(self.measure(lambda steps: work.reach(steps / self._unit_steps))) as measured:
+                    for of_unit in measured:
                         rows += of_unit
                         work.end_unit()
                         self.results.write_unfinished(self._findings(rows).tables, work.ended, self._num_units)
+                        kept = work.ended
             except BaseException:
-                if work.ended:
-                    _say(f"{work.ended} of {self._num_units} {self._unit}s are in {self.results.path / UNFINISHED}")
+                if kept:
+                    _say(f"{kept} of {units} are in {self.results.path / UNFINISHED}")
                 raise
         return rows
 

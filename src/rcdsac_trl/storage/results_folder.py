@@ -43,7 +43,12 @@ class ResultsFolder:
         self._check()
 
     def write_unfinished(self, tables: Mapping[str, str], ended: int, total: int) -> None:
-        """Write the tables of what has ended so far: how many units of how many."""
+        """Write the tables of what has ended so far: how many units of how many.
+
+        Raises:
+            UserInputError: as :meth:`write`.
+        """
+        self._check()
         self._unfinished.mkdir(parents=True, exist_ok=True)
         for name, content in tables.items():
             atomic.write(self._unfinished / name, content.encode())

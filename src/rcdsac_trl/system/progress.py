@@ -90,7 +90,7 @@ class Work:
 
     def __str__(self) -> str:
         """Say how far it is."""
-        done = f"{self.ended} of {self._total} {self._unit}s" if self._total > 1 else f"{self._reached:.0%}"
+        done = f"{self.ended} of {counted(self._total, self._unit)}" if self._total > 1 else f"{self._reached:.0%}"
         left_s = self.left_s()
         return done if left_s is None else f"{done}, about {duration(left_s)} left"
 
@@ -123,6 +123,16 @@ def never_silent(silence_s: float = SILENCE_S) -> Iterator[None]:
     finally:
         over.set()
         teller.join()
+
+
+def counted(number: int, unit: str) -> str:
+    """Put a number of units into words.
+
+    Example:
+        >>> counted(1, "map"), counted(12, "run")
+        ('1 map', '12 runs')
+    """
+    return f"{number} {unit}{'' if number == 1 else 's'}"
 
 
 def duration(seconds: float) -> str:

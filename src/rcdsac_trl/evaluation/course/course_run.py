@@ -31,7 +31,7 @@ from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
-from rcdsac_trl.system.progress import Watch, Work
+from rcdsac_trl.system.progress import Watch, Work, counted
 from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.maps.shapes import Box
 from rcdsac_trl.world.office.building import COURSE_M, Office, make_office
@@ -169,7 +169,7 @@ def _films(entries: Sequence[Entry], folder: Path, rows: Rows) -> list[Path]:
     office = make_office()
     kept = sorted((row for row in rows if "trace" in row), key=lambda row: row["number"])
     files = []
-    with Work(f"{len(kept)} films, for {folder}", len(kept), "film") as work:
+    with Work(f"{counted(len(kept), 'film')}, for {folder}", len(kept), "film") as work:
         for row in kept:
             job, trace = row["job"], row["trace"]
             entry = entries[job.entry]
