@@ -15,7 +15,9 @@ from rcdsac_trl.config.compose import combinations, compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.evaluation.evaluation import make_evaluation
+from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.storage.checkpoint import Checkpoints
 from rcdsac_trl.storage.checkpoint_record import Progress
@@ -99,6 +101,16 @@ def evaluate(*overrides: str) -> Path:
     evaluation = make_evaluation(compose("evaluate", given))
     evaluation.run()
     return evaluation.results.path
+
+
+def exported(run: Path, folder: Path) -> Path:
+    """Write what an export of a run's best checkpoint is measured by, which takes less time than its programs."""
+    agent = named_agent(run)
+    folder.mkdir()
+    assert agent.training is not None
+    for name, content in (packed(agent.weights()) | {"training.yaml": agent.training}).items():
+        (folder / name).write_bytes(content)
+    return folder
 
 
 def evaluation_betas(row: str) -> list[float]:

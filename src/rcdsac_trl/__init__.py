@@ -41,7 +41,8 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
 
     Args:
         name_or_folder: an agent that comes with the package, a folder that ``python -m rcdsac_trl.export`` wrote, or
-            a run folder, whose best checkpoint it is then. Only the last needs TorchRL, and takes seconds to import.
+            a run folder, whose best checkpoint it is then; every command takes the same three. Only the last needs
+            TorchRL, and takes seconds to import.
         options: keywords of :class:`rcdsac_trl.deploy.Policy`.
 
     Raises:
@@ -50,11 +51,10 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
     # Imported late, so that importing the package stays instant.
     from rcdsac_trl.deploy import Policy, find_weights, read_weights
 
-    folder = Path(name_or_folder)
-    if (folder / "checkpoints").is_dir():
-        from rcdsac_trl.release.run_weights import weights_of_run
+    if (Path(name_or_folder) / "checkpoints").is_dir():
+        from rcdsac_trl.release.named_agent import named_agent
 
-        return Policy(weights_of_run(folder, "best"), **options)
+        return Policy(named_agent(name_or_folder).weights(), **options)
     return Policy(read_weights(find_weights(name_or_folder)), **options)
 
 

@@ -1,4 +1,4 @@
-"""Hold the critics' quantiles against what happens: ``python -m rcdsac_trl.calibrate run=<folder> beta=[-2,-1]``."""
+"""Hold the critics' quantiles against what happens: ``python -m rcdsac_trl.calibrate run=<agent> beta=[-2,-1]``."""
 
 from rcdsac_trl.cli import Command
 

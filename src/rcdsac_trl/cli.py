@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from signal import SIGINT
 from typing import Any, NoReturn
 
 import hydra
@@ -17,13 +18,15 @@ from rcdsac_trl.config.command_line import expanded, key_of
 from rcdsac_trl.config.compose import combinations, compose, output_folder, with_sections
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import FaultError, UserInputError
+from rcdsac_trl.system.interrupts import ended_by, endings_as_interrupts
+from rcdsac_trl.system.progress import never_silent
 from rcdsac_trl.system.resources import fault_sentence
 from rcdsac_trl.system.runtime import bound_threads, keep_pages, let_workers_rest, quiet_libraries, speak_anywhere
 
 Task = Callable[[DictConfig], None]
 
-# What a shell reports for a process that Ctrl-C ended.
-INTERRUPTED = 130
+# What a shell reports for a process that a signal ended is this and the signal's number.
+_ENDED_BY_SIGNAL = 128
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,8 @@ class Command:
             _function(self.make)(cfg).run(*described_by)
 
         look = None if self.look is None else late(self.look)
-        entry_point(self.name, check=self.check, look=look)(task)()
+        with never_silent():
+            entry_point(self.name, check=self.check, look=look)(task)()
 
 
 @dataclass(frozen=True)
@@ -156,17 +160,19 @@ def _function(named: str | Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _program(start: Callable[[], None]) -> None:
-    """Do what a program does, so that a mistake, a fault and Ctrl-C each end it as its users expect."""
+    """Do what a program does, so that a mistake, a fault, Ctrl-C and SIGTERM each end it as its users expect."""
     try:
         bound_threads()
         keep_pages()
         quiet_libraries()
         let_workers_rest()
         speak_anywhere()
-        start()
+        with endings_as_interrupts():
+            start()
     except KeyboardInterrupt:
-        print("rcdsac_trl: interrupted", file=sys.stderr)
-        raise SystemExit(INTERRUPTED) from None
+        number = ended_by()
+        print(f"rcdsac_trl: {'interrupted' if number is SIGINT else f'ended by {number.name}'}", file=sys.stderr)
+        raise SystemExit(_ENDED_BY_SIGNAL + number) from None
     except Exception as error:
         _fail_or_raise(error)
 

@@ -13,6 +13,7 @@ from rcdsac_trl.cli import Command
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.checks import check_least
+from rcdsac_trl.system.progress import Work, counted
 from rcdsac_trl.system.resources import check_picture
 from rcdsac_trl.world.maps.contact_sheet import contact_sheet
 from rcdsac_trl.world.maps.generator import MapSettings, Split
@@ -45,7 +46,8 @@ class Sheet:
         """Write the picture."""
         out = Path(self.out)
         out.parent.mkdir(parents=True, exist_ok=True)
-        contact_sheet(self.map, self.split, self.seed, self.count).savefig(out, dpi=130)
+        with Work(f"{counted(self.count, 'map')}, then their picture, {out}", self.count, "map") as work:
+            contact_sheet(self.map, self.split, self.seed, self.count, drawn=work.end_unit).savefig(out, dpi=130)
         print(f"drew {self.count} maps: {out}")
 
 

@@ -1,4 +1,4 @@
-"""Evaluate an agent on unseen maps: ``python -m rcdsac_trl.evaluate run=<folder> beta=[-2,-1]``."""
+"""Evaluate an agent on unseen maps: ``python -m rcdsac_trl.evaluate run=<folder or shipped agent> beta=[-2,-1]``."""
 
 from rcdsac_trl.cli import Command
 

@@ -1,4 +1,4 @@
-"""Export an agent for a robot: ``python -m rcdsac_trl.export run=<folder>``."""
+"""Export an agent for a robot: ``python -m rcdsac_trl.export run=<folder or shipped agent>``."""
 
 from rcdsac_trl.cli import Command
 

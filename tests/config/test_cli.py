@@ -1,11 +1,13 @@
 """The command line: a mistake ends in one sentence and code 2, with nothing written; Ctrl-C ends in a checkpoint."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 
@@ -42,6 +44,7 @@ def refusal(
 
     monkeypatch.setattr("rcdsac_trl.training.setup.make_trainer", started)
     monkeypatch.setattr(MeasuredRun, "run", started)
+    monkeypatch.setattr("rcdsac_trl.cli.never_silent", nullcontext)  # however long it takes
 
     def call(main: Callable[[], None], arguments: list[str]) -> str:
         monkeypatch.setattr(sys, "argv", ["prog", *arguments])
@@ -218,14 +221,15 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
 
 # ------------------------------------------------------------------------------------------------ evaluate
 RUN = "run=<the tiny run>"
+EITHER = "name what to evaluate: either run=<folder or shipped agent>"
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ([], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
-        ([RUN, "baseline=pursuit"], "name what to evaluate: either run=<folder> or baseline=<name>, such as mppi"),
-        (["run=nowhere"], "run=nowhere holds no config.yaml: name a folder that training wrote"),
+        ([], f"{EITHER} or baseline=<name>, such as mppi"),
+        ([RUN, "baseline=pursuit"], f"{EITHER} or baseline=<name>, such as mppi"),
+        (["run=nowhere"], "there is no agent 'nowhere': shipped are "),
         (["run=123"], "run=123 must be text or null"),
         ([RUN], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
         ([RUN, "beta=[]"], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
@@ -234,7 +238,7 @@ RUN = "run=<the tiny run>"
         ([RUN, "beta=[low]"], "beta=['low'] must be a list of numbers in brackets or null"),
         ([RUN, "beta=[-1,-1.0]"], "beta=-1 is given more than once"),
         ([RUN, "beta=[-1]", "collision_weight=[1]"], "rcdsac_pow has no collision weight: leave collision_weight out"),
-        ([RUN, "beta=[-1]", "sensor=sparse"], "sensor=sparse does not fit: "),
+        ([RUN, "beta=[-1]", "sensor=sparse"], "sensor=sparse sensor.memory_s=0 does not fit: "),
         ([RUN, "beta=[-1]", "checkpoint=first"], "checkpoint=first must be one of best, last"),
         ([RUN, "beta=[-1]", "split=train"], "split=train must be one of evaluation, validation"),
         ([RUN, "beta=[-1]", "sampled=often"], "sampled=often must be true or false"),
@@ -410,7 +414,7 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
         assert (cwd / "there" / name).read_bytes() == (here / name).read_bytes()
 
 
-def interrupt(folder: Path, *arguments: str) -> tuple[int, str]:
+def interrupt(folder: Path, *arguments: str, by: signal.Signals = signal.SIGINT) -> tuple[int, str]:
     """Train without end, press Ctrl-C after the second iteration; return the exit code and stderr."""
     endless = [*TINY, "schedule.iterations=100000", "validation.every_iterations=100000", *arguments]
     process = start(folder, "rcdsac_trl.train", POW, *endless, f"hydra.run.dir={folder / 'run'}")
@@ -420,20 +424,47 @@ def interrupt(folder: Path, *arguments: str) -> tuple[int, str]:
         if log.exists() and "   2/100000" in log.read_text():  # the first one is saved then
             break
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the whole group, workers included
+    os.killpg(process.pid, by)  # as a terminal does: to the whole group, workers included
     _, err = process.communicate(timeout=300)
     return process.returncode, err
 
 
-def test_ctrl_c_ends_with_a_checkpoint_and_without_a_traceback(tmp_path: Path) -> None:
-    code, err = interrupt(tmp_path)
-    assert code == 130
+@pytest.mark.parametrize(
+    ("by", "code", "told"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "ended by SIGTERM")],
+)
+def test_ctrl_c_and_sigterm_end_with_a_checkpoint_and_without_a_traceback(
+    tmp_path: Path, by: signal.Signals, code: int, told: str
+) -> None:
+    ended, err = interrupt(tmp_path, by=by)
+    assert ended == code
     assert "Traceback" not in err
-    assert err.splitlines()[-1] == "rcdsac_trl: interrupted"
+    assert "leaked" not in err
+    assert err.splitlines()[-1] == f"rcdsac_trl: {told}"
     run = tmp_path / "run"
     assert load_progress(run / "checkpoints", "last").updates >= 2
     assert f" are saved, resume={run} continues there" in (run / "train.log").read_text()
     assert (run / "training_episodes.csv").exists()
+
+
+def test_sigterm_ends_an_evaluation_and_its_processes_and_keeps_the_maps_that_have_ended(
+    tiny_run: Path, tmp_path: Path
+) -> None:
+    given = [f"run={tiny_run}", "beta=[-1]", "num_maps=100000", "num_episodes=1", "num_workers=2", "out=there"]
+    process = start(tmp_path, "rcdsac_trl.evaluate", *given)
+    kept = tmp_path / "there" / "unfinished" / "evaluation.json"
+    deadline = time.monotonic() + 300
+    while process.poll() is None and not kept.exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGTERM)  # as clusters do: to the whole group, workers included
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 143
+    told = err.splitlines()
+    assert told[0] == "rcdsac_trl: 100000 maps in 2 processes, for there"
+    assert re.fullmatch(r"rcdsac_trl: \d+ of 100000 maps are in there/unfinished", told[-2])
+    assert told[-1] == "rcdsac_trl: ended by SIGTERM"
+    assert "leaked" not in err
+    assert sorted(path.name for path in kept.parent.iterdir()) == ["episodes.csv", "evaluation.json", "summary.csv"]
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ from rcdsac_trl.cli import read_arguments
 from rcdsac_trl.config.command_line import expanded
 from rcdsac_trl.config.compose import choices, compose, output_folder, parse
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings
-from rcdsac_trl.config.run_config import read_config, settings_driven_by, training_settings
+from rcdsac_trl.config.named_folder import default_training
+from rcdsac_trl.config.run_config import read_config, training_settings
 from rcdsac_trl.errors import UserInputError
 
 POW = "+algo=rcdsac_pow"
@@ -139,7 +140,7 @@ def test_an_evaluation_changes_single_keys_of_what_was_trained() -> None:
     maps, _, task = settings.world_of(trained)
     easy = training_settings(compose("train", [POW, "map=easy", "map.num_movers=1"]))
     assert (maps, task.range_dropout) == (easy.map, 0.0)
-    assert settings_driven_by(None).map.num_movers == 4
+    assert default_training().map.num_movers == 4
 
 
 @pytest.mark.parametrize(

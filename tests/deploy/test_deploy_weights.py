@@ -105,9 +105,9 @@ def test_names_and_folders(tmp_path: Path) -> None:
     assert shipped_names(shipped) == ["bold"]
     assert find_weights("bold", shipped) == folder
     assert find_weights(folder, shipped) == folder
-    with pytest.raises(UserInputError, match="there is no agent 'averse': shipped are bold; or name a folder"):
+    with pytest.raises(UserInputError, match="there is no agent 'averse': shipped are bold; or name a run folder"):
         find_weights("averse", shipped)
-    with pytest.raises(UserInputError, match=r"holds no config\.json"):
+    with pytest.raises(UserInputError, match=r"holds neither checkpoints nor config\.json: shipped are bold; or name"):
         find_weights(tmp_path, shipped)
 
 

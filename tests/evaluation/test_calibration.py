@@ -14,6 +14,7 @@ from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import fractions, predict, roll_out
 from rcdsac_trl.evaluation.calibration import make_calibration
+from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.report import calibration_report as measured
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.make_agent import make_loss
@@ -203,6 +204,23 @@ def test_a_calibration_writes_the_same_whoever_drives(tiny_run: Path, tmp_path: 
     assert (outs[0] / "calibration.png").stat().st_size > 10_000
 
 
+def test_an_exported_agent_brings_what_a_calibration_needs(tiny_run: Path, tmp_path: Path) -> None:
+    folder = tiny.exported(tiny_run, tmp_path / "agent")
+    (loss, average), critics = named_agent(tiny_run).load(), named_agent(folder).load_critics()
+    assert critics.alpha.item() == pytest.approx(loss.alpha.item(), rel=1e-6)
+    assert critics.alpha.item() != make_loss(tiny.tiny_settings(), "cpu").alpha.item()  # learnt, not the config's
+    trained, found = loss.state_dict(), critics.state_dict()
+    names = [name for name in trained if name.startswith("critic_network_params.")]
+    assert names
+    assert all(torch.equal(trained[name], found[name]) for name in names)
+    for name, value in average.module.state_dict().items():  # it drives: the learning actor is not exported
+        assert torch.equal(found[f"actor_network_params.{name}"], value)
+    calibration = calibrate(folder, "beta=[-1]", "num_maps=1", "num_workers=0")
+    calibration.run()
+    assert calibration.results.path.parent == folder / "calibration"
+    assert len(pd.read_csv(calibration.results.path / "predictions.csv")) == 2
+
+
 def test_what_cannot_be_calibrated_is_refused(tiny_run: Path, tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="drives as its beta says"):
         calibrate(tiny_run)
@@ -211,6 +229,10 @@ def test_what_cannot_be_calibrated_is_refused(tiny_run: Path, tmp_path: Path) ->
     # Of 3 states and in one process; a simulation takes 28 MB.
     with pytest.raises(UserInputError, match=r"3000000 simulations: 84000\.0 GB .* lower num_rollouts"):
         calibrate(tiny_run, "beta=[-1]", "num_states=3", "num_rollouts=1_000_000", "num_workers=0")
+    with pytest.raises(
+        UserInputError, match=r"rcdsac_pow-narrow does not say at which temperature .* export the agent"
+    ):
+        calibrate(Path("rcdsac_pow-narrow"), "beta=[-1]")
     with pytest.raises(UserInputError, match="run=<folder>"):
         make_calibration(compose("calibrate", []))
     OmegaConf.save(tiny.tiny_cfg("sac"), tmp_path / "config.yaml", resolve=True)

@@ -21,6 +21,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.deploy import shipped_names
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout import map_evaluator as driver
@@ -37,7 +38,7 @@ from rcdsac_trl.training.validation import Snapshot
 from rcdsac_trl.world.maps.shapes import Kind
 from rcdsac_trl.world.task.env import make_env
 from rcdsac_trl.world.task.world_settings import WorldSettings
-from tiny import evaluate, tiny_settings, tiny_trainer
+from tiny import evaluate, evaluation_betas, exported, tiny_settings, tiny_trainer
 
 FILES = ("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json")
 
@@ -159,6 +160,101 @@ def test_nothing_is_written_when_it_is_stopped(
     with pytest.raises(KeyboardInterrupt):
         evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     assert not (tmp_path / "out").exists()
+
+
+def test_what_has_ended_is_kept_and_a_later_call_says_so(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    given = [f"run={run}", "beta=[-1]", "num_maps=3", f"out={out}"]
+    metrics, calls = measurement.episode_metrics, iter(range(100))
+
+    def stop_on_the_third_map(*args: Any, **kwargs: Any) -> Any:
+        if next(calls) == 2:
+            raise KeyboardInterrupt
+        return metrics(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(measurement, "episode_metrics", stop_on_the_third_map)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(*given)
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == f"rcdsac_trl: 3 maps, for {out}"
+    assert told[-1] == f"rcdsac_trl: 2 of 3 maps are in {out / 'unfinished'}"
+    assert [path.name for path in out.iterdir()] == ["unfinished"]  # nothing that looks like an evaluation
+    assert json.loads((out / "unfinished" / "evaluation.json").read_text())["units_ended"] == 2
+    kept = contents(out / "unfinished")["episodes.csv"]
+
+    with pytest.raises(UserInputError, match="holds the unfinished evaluation of something else: give another folder"):
+        evaluate(*given, "seed=1")
+    assert contents(out / "unfinished")["episodes.csv"] == kept
+    whole = contents(evaluate(*given))["episodes.csv"]
+    assert "rcdsac_trl: an earlier call ended after 2 of 3 maps: all are measured anew" in capsys.readouterr().err
+    assert whole.startswith(kept)
+    assert not (out / "unfinished").exists()
+
+
+def test_a_whole_evaluation_stays_until_the_next_is_whole(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [f"run={run}", "beta=[-1]", "num_maps=2", f"out={tmp_path / 'out'}"]
+    before = contents(evaluate(*given))
+    metrics, calls = measurement.episode_metrics, iter(range(100))
+
+    def stop_on_the_second_map(*args: Any, **kwargs: Any) -> Any:
+        if next(calls) == 1:
+            raise KeyboardInterrupt
+        return metrics(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(measurement, "episode_metrics", stop_on_the_second_map)
+        with pytest.raises(KeyboardInterrupt):
+            evaluate(*given)
+    assert {name: (tmp_path / "out" / name).read_bytes() for name in FILES} == before
+    assert contents(evaluate(*given)) == before
+
+
+# ------------------------------------------------------------------------------------------------ three forms
+def test_an_exported_agent_does_what_its_run_does(run: Path, tmp_path: Path) -> None:
+    folder = exported(run, tmp_path / "agent")
+    given = ["beta=[-2,-1]", "beta_controller=[tail_variance]"]  # which asks the critics, too
+    of_run = contents(evaluate(f"run={run}", *given, f"out={tmp_path / 'run'}"))
+    out = evaluate(f"run={folder}", *given)
+    assert out.parent == folder / "evaluation"
+    assert contents(out)["episodes.csv"] == of_run["episodes.csv"]
+    described, of_run_described = (json.loads(c["evaluation.json"]) for c in (contents(out), of_run))
+    digest = json.loads((folder / "config.json").read_text())["weights_sha256"]
+    assert described.pop("weights_sha256") == digest
+    assert described == of_run_described
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_every_shipped_agent_can_be_measured_again(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    row = name.partition("-")[0]
+    betas = [f"beta={evaluation_betas(row)}".replace(" ", "")] if evaluation_betas(row) else []
+    out = evaluate(f"run={name}", *betas, "seed=7", "num_episodes=1", "task=default", "task.episode_steps=20")
+    assert out.parts[:1] == ("evaluation",)
+    assert out.name.startswith(f"{name}-evaluation-seed7-1x1")
+    described = json.loads((out / "evaluation.json").read_text())
+    assert (described["agent"], described["sensor"], described["checkpoint"]) == (row, "narrow", "last")
+    assert described["map"]["size_m"] == 20.0
+
+
+def test_what_is_no_agent_of_one_s_own_is_refused(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserInputError, match="checkpoint=best chooses among those of a run, and run=sac-narrow is one"):
+        evaluate("run=sac-narrow", "checkpoint=best")
+    with pytest.raises(
+        UserInputError, match=r"holds neither checkpoints nor config\.json: shipped are dsac_pow-narrow"
+    ):
+        evaluate(f"run={tmp_path}")
+    folder = exported(run, tmp_path / "agent")
+    (folder / "training.yaml").write_text((folder / "training.yaml").read_text().replace("name: narrow", "name: full"))
+    with pytest.raises(UserInputError, match=r"training\.yaml is of another agent than the weights: export it anew"):
+        evaluate(f"run={folder}", "beta=[-1]")
+    (folder / "training.yaml").unlink()
+    with pytest.raises(UserInputError, match=r"holds no training\.yaml, .* export it anew .* or name its run folder"):
+        evaluate(f"run={folder}", "beta=[-1]")
 
 
 # ------------------------------------------------------------------------------------------------ numbers

@@ -51,7 +51,8 @@ def test_what_is_published_drives_and_is_reported_on(
     publish(evaluated, tmp_path)
     assert capsys.readouterr().out.startswith("rcdsac_pow-narrow: ")
     folder = tmp_path / "weights" / "rcdsac_pow-narrow"
-    assert {path.name for path in folder.iterdir()} == {"README.md", "config.json", "weights.safetensors"}
+    written = {"README.md", "config.json", "training.yaml", "weights.safetensors"}
+    assert {path.name for path in folder.iterdir()} == written
     command = rcdsac_trl.load(folder, guard=None).act(OPEN, AHEAD, STANDING, -1.0)
     full = rcdsac_trl.load(evaluated, guard=None).act(OPEN, AHEAD, STANDING, -1.0)
     assert command.wanted == pytest.approx(full.wanted, abs=0.01)
@@ -78,6 +79,8 @@ def test_nothing_is_published_twice_or_without_its_evaluation(evaluated: Path, t
         make_publication(compose("publish", [f"runs=[{evaluated},{evaluated}]"]))
     with pytest.raises(UserInputError, match="no evaluation of its checkpoint best"):
         make_publication(compose("publish", [f"runs=[{evaluated}]", "checkpoint=best"]))
+    with pytest.raises(UserInputError, match=r"sac-narrow is an agent that was exported, .* name the run folder"):
+        make_publication(compose("publish", ["runs=[sac-narrow]"]))
     with pytest.raises(UserInputError, match="name what to publish"):
         make_publication(compose("publish", []))
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before

@@ -163,7 +163,7 @@ def test_a_run_goes_on_after_a_process_was_lost(
     log = (run / "train.log").read_text()
     (agent,) = lost  # each process holds the agent of its number
     name = f"Ray process {agent + 1} of 2 (split train, seed 0, agents {agent})"
-    assert f"iteration 1, training map 1: {name} {told}" in log
+    assert f"iteration 2, training map 1: {name} {told}" in log
     assert "; restart 1 of at most 5\nthe episodes on map 1 are dropped" in log
     assert [(each.iteration, each.map_index) for each in asked] == [(0, 0), (1, 1), (1, 2), (2, 3)]
     # What agents are told follows from agent and map: every agent's episodes are there, once.

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from rcdsac_trl.system.interrupts import at_safe_points, interruption_point
+from rcdsac_trl.system.interrupts import at_safe_points, ended_by, endings_as_interrupts, interruption_point
 
 
 def press() -> None:
@@ -36,6 +36,40 @@ def test_afterwards_everything_is_as_before() -> None:
     interruption_point()  # a press that nobody served is not kept for the next run
     with at_safe_points():
         interruption_point()
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP])
+def test_what_ends_a_program_is_served_as_ctrl_c(ending: signal.Signals) -> None:
+    before = signal.getsignal(ending)
+    with endings_as_interrupts():
+        assert ended_by() is signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(ending)
+        assert ended_by() is ending
+        with at_safe_points():
+            signal.raise_signal(ending)  # waits
+            with pytest.raises(KeyboardInterrupt):
+                interruption_point()
+    assert signal.getsignal(ending) is before
+
+
+def test_it_is_served_where_ctrl_c_is_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of what a shell starts in the background
+    try:
+        with endings_as_interrupts(), pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_an_ending_that_is_ignored_stays_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # by nohup
+    try:
+        with endings_as_interrupts():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_another_thread_may_train() -> None:

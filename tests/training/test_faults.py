@@ -69,8 +69,8 @@ def test_a_run_goes_on_after_a_worker_was_killed(tmp_path: Path, signalled: Call
     tiny_trainer(run, "rcdsac_pow", *WORKERS).run()
     told = (run / "train.log").read_text()
     assert (
-        "iteration 1, training map 1: worker process 2 of 2 (split train, seed 0, agents 1) was killed by SIGKILL; "
-        "restart 1 of at most 5\nthe episodes on map 1 are dropped: iteration 1 drives on the next\n"
+        "iteration 2, training map 1: worker process 2 of 2 (split train, seed 0, agents 1) was killed by SIGKILL; "
+        "restart 1 of at most 5\nthe episodes on map 1 are dropped: iteration 2 drives on the next\n"
     ) in told
     rows = training_rows(run)
     assert rows["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
@@ -100,7 +100,7 @@ def test_a_run_goes_on_after_a_collecting_process_was_killed(tmp_path: Path, mon
     monkeypatch.setattr(WorkerProcesses, "ask", killing)
     run = tmp_path / "run"
     tiny_trainer(run, "rcdsac_pow", "collector.num_processes=2", "schedule.iterations=3").run()
-    told = "iteration 1, training map 1: worker process 2 of 2 (split train, seed 0, agents 1) was killed by SIGKILL"
+    told = "iteration 2, training map 1: worker process 2 of 2 (split train, seed 0, agents 1) was killed by SIGKILL"
     assert told in (run / "train.log").read_text()
     assert training_rows(run)["iteration"].tolist() == [0, 0, 1, 1, 2, 2]
     progress = newest(run / CHECKPOINTS, replay=run / "replay")[0].progress
@@ -145,7 +145,7 @@ def test_a_worker_that_hangs_counts_as_dead_and_too_many_faults_end_the_run(
     # Making a map takes a moment too, and other work may take the core meanwhile.
     trainer = tiny_trainer(run, "rcdsac_pow", *WORKERS, "world.worker_timeout_s=6", "world.max_restarts=1")
     told = (
-        "iteration 1, training map 2: one of 2 worker processes (split train, seed 0, agents 0; split train, seed 0, "
+        "iteration 2, training map 2: one of 2 worker processes (split train, seed 0, agents 0; split train, seed 0, "
         "agents 1) gave no answer within 6 s; "
         f"world.max_restarts=1 allows no further restart: training stops; 1 iterations are saved, resume={run} "
         "continues there"
@@ -430,7 +430,7 @@ def test_memory_that_ends_stops_a_run_in_one_sentence(tmp_path: Path, allocate: 
     trainer = tiny_trainer(run)
     trainer.learner.replay.add_episodes = lambda _: allocate()  # type: ignore[method-assign]
     with pytest.raises(
-        TrainingError, match=r"^there is not enough memory.*training stops in iteration 0; 0 iterations"
+        TrainingError, match=r"^there is not enough memory.*training stops in iteration 1; 0 iterations"
     ):
         trainer.run()
     assert newest(run / CHECKPOINTS)[0].progress.iterations == 0

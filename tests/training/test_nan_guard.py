@@ -47,8 +47,8 @@ def test_an_update_that_is_not_finite_ends_the_run_and_is_shown_again(
     trainer = tiny_trainer(tmp_path / "run")
     spoil_rewards(trainer, monkeypatch, value, update=3)  # the second of the second iteration
     told = failing(trainer)
-    dump = tmp_path / "run" / "failure" / "iteration-000001-update-000001"
-    assert f"is NaN or infinite in iteration 1: training stops; {dump} shows it again" in told
+    dump = tmp_path / "run" / "failure" / "iteration-000002-update-000002"
+    assert f"is NaN or infinite in iteration 2: training stops; {dump} shows it again" in told
     assert told.startswith("loss_qvalue = ")
     assert (tmp_path / "run" / "train.log").read_text().splitlines()[-1] == told
     # No weight has moved: what is in memory and in the dump is from before the update.
@@ -66,13 +66,13 @@ def test_an_update_that_is_not_finite_ends_the_run_and_is_shown_again(
         torch.testing.assert_close(again[key], seen[key], rtol=0, atol=0, equal_nan=True)
     assert not again["loss_qvalue"].isfinite()
     assert again["loss_actor"].isfinite()
-    assert json.loads((dump / "failure.json").read_text())["iteration"] == 1
+    assert json.loads((dump / "failure.json").read_text())["iteration"] == 2
 
 
 def test_a_gradient_that_is_not_finite_ends_the_run_although_the_losses_are(tmp_path: Path) -> None:
     trainer = tiny_trainer(tmp_path / "run")
     trainer.learner.loss.log_alpha.register_hook(lambda gradient: gradient * math.nan)
-    assert failing(trainer).startswith("gradient norm of parameter group 2 = nan is NaN or infinite in iteration 0")
+    assert failing(trainer).startswith("gradient norm of parameter group 2 = nan is NaN or infinite in iteration 1")
     assert load_progress(tmp_path / "run" / "checkpoints", "last").iterations == 0
 
 
@@ -97,9 +97,9 @@ def test_an_episode_that_is_not_finite_is_never_stored(
         return batch
 
     trainer.episodes.collect = spoilt  # type: ignore[method-assign]
-    assert failing(trainer).startswith(f"{name} of episode 1 at step {step} is NaN or infinite in iteration 0: ")
+    assert failing(trainer).startswith(f"{name} of episode 1 at step {step} is NaN or infinite in iteration 1: ")
     assert len(trainer.learner.replay) == 0
-    dump = load_failure(tmp_path / "run" / "failure" / "iteration-000000", make_loss(tiny_settings(), "cpu"))
+    dump = load_failure(tmp_path / "run" / "failure" / "iteration-000001", make_loss(tiny_settings(), "cpu"))
     assert dump[key][1, step, 0] == -math.inf
     assert dump[key].isfinite().sum() == dump[key].numel() - 1
 
@@ -122,7 +122,7 @@ def test_a_device_that_is_not_waited_for_is_asked_once_an_iteration(tmp_path: Pa
     trainer.guard._failed = torch.tensor(False)
     trainer.guard.end_iteration()
     trainer.guard._failed = torch.tensor(True)
-    with pytest.raises(TrainingError, match="became NaN or infinite in iteration 0: training stops"):
+    with pytest.raises(TrainingError, match="became NaN or infinite in iteration 1: training stops"):
         trainer.guard.end_iteration()
     trainer.guard.start_iteration(1)
     trainer.guard.end_iteration()

@@ -390,7 +390,7 @@ def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
     events.clear()
     with pytest.raises(ZeroDivisionError):
         stub_trainer(tmp_path, events, checkpoint_every=1, on_iteration_end=fail).run()
-    sentence = f"on_iteration_end failed in iteration 0 (ZeroDivisionError:); 0 iterations are saved, resume={tmp_path}"
+    sentence = f"on_iteration_end failed in iteration 1 (ZeroDivisionError:); 0 iterations are saved, resume={tmp_path}"
     assert sentence in (tmp_path / "train.log").read_text()
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
 
@@ -402,7 +402,7 @@ def test_ctrl_c_drops_the_iteration_and_closes_everything(tmp_path: Path) -> Non
         trainer.run()
     assert [event[1].iterations for event in kinds(events, "save")] == [0, 1, 2]
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
-    told = f"interrupted in iteration 2; 2 iterations are saved, resume={tmp_path} continues there"
+    told = f"interrupted in iteration 3; 2 iterations are saved, resume={tmp_path} continues there"
     assert told in (tmp_path / "train.log").read_text().splitlines()
 
 
@@ -707,8 +707,8 @@ def test_an_iteration_whose_workers_fail_is_driven_on_the_next_map(tmp_path: Pat
     ]  # fmt: skip
     told = (tmp_path / "train.log").read_text().splitlines()
     assert told[4:6] == [
-        "iteration 1, training map 1: worker process 1 of 1 was killed by SIGKILL; restart 1 of at most 3",
-        "the episodes on map 1 are dropped: iteration 1 drives on the next",
+        "iteration 2, training map 1: worker process 1 of 1 was killed by SIGKILL; restart 1 of at most 3",
+        "the episodes on map 1 are dropped: iteration 2 drives on the next",
     ]
     # A run that is continued goes on behind the maps that were given up.
     events.clear()
@@ -735,7 +735,7 @@ def test_workers_that_fail_too_often_end_a_run(tmp_path: Path, faulty: set[int])
     faulty.update([2, 3])
     trainer = stub_trainer(tmp_path, events, checkpoint_every=1, max_restarts=1)
     told = (
-        "iteration 2, training map 3: worker process 1 of 1 was killed by SIGKILL; world.max_restarts=1 allows no "
+        "iteration 3, training map 3: worker process 1 of 1 was killed by SIGKILL; world.max_restarts=1 allows no "
         f"further restart: training stops; 2 iterations are saved, resume={tmp_path} continues there"
     )
     with pytest.raises(TrainingError, match=re.escape(told)):

@@ -64,14 +64,14 @@ class ExportSettings:
     """The root of ``conf/export.yaml``."""
 
     run: str | None
-    checkpoint: Name
+    checkpoint: Name | None
     out: str | None
     num_quantiles: int
 
     def __post_init__(self) -> None:
         """Refuse an export of nothing."""
         if self.run is None:
-            raise UserInputError("name what to export: run=<folder>")
+            raise UserInputError("name what to export: run=<folder>, or a shipped agent")
         check_least("num_quantiles", self.num_quantiles, 1)
 
 
@@ -84,7 +84,7 @@ class EvaluationSettings:
     collision_weight: tuple[float, ...] | None
     beta_controller: tuple[Literal["clearance", "tail_variance"], ...] | None
     controller: ControllerSettings
-    checkpoint: Name
+    checkpoint: Name | None
     baseline: str | None
     split: Literal["evaluation", "validation"]
     seed: int
@@ -106,7 +106,9 @@ class EvaluationSettings:
     def __post_init__(self) -> None:
         """Refuse what is below its limit, and neither or both of run and baseline."""
         if (self.run is None) == (self.baseline is None):
-            raise UserInputError("name what to evaluate: either run=<folder> or baseline=<name>, such as mppi")
+            raise UserInputError(
+                "name what to evaluate: either run=<folder or shipped agent> or baseline=<name>, such as mppi"
+            )
         if self.out == "":
             raise UserInputError("out names no folder: give it one, or leave it out")
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
@@ -156,7 +158,7 @@ class CalibrationSettings:
 
     run: str | None
     beta: tuple[float, ...] | None
-    checkpoint: Name
+    checkpoint: Name | None
     split: Literal["evaluation", "validation"]
     seed: int
     num_maps: int

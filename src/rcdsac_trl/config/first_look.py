@@ -15,7 +15,8 @@ from rcdsac_trl.config.evaluation_settings import (
     ExportSettings,
     PublishSettings,
 )
-from rcdsac_trl.config.run_config import agent_of_run, read_config, settings_driven_by, settings_of_run
+from rcdsac_trl.config.named_folder import default_training, find_agent
+from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.deploy import find_weights
 from rcdsac_trl.system.resources import check_out, check_writable
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -28,7 +29,7 @@ def look_at_evaluation(cfg: DictConfig) -> None:
         UserInputError: naming what is wrong.
     """
     settings = read_config(cfg, EvaluationSettings)
-    trained = settings_driven_by(None if settings.run is None else Path(settings.run))
+    trained = default_training() if settings.run is None else find_agent(settings.run).settings()
     if settings.run is not None:
         trained.algo.conditions(settings.beta, settings.collision_weight)
     maps, sensor, task = settings.world_of(trained)
@@ -44,7 +45,7 @@ def look_at_calibration(cfg: DictConfig) -> None:
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is not None:
-        settings_of_run(Path(settings.run))
+        find_agent(settings.run).settings()
     _look_at_out(settings.out)
 
 
@@ -68,8 +69,8 @@ def look_at_export(cfg: DictConfig) -> None:
         UserInputError: naming what is wrong.
     """
     settings = read_config(cfg, ExportSettings)
-    if settings.run is not None:
-        agent_of_run(Path(settings.run))
+    if settings.run is not None and (found := find_agent(settings.run)).is_run:
+        agent_of_run(found.path)
     _look_at_out(settings.out)
 
 

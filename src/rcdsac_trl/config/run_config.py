@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
-from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.config.compose import choices
 from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
@@ -22,6 +22,8 @@ CONFIG_NAME = "config.yaml"
 """What makes a folder a run folder."""
 CHECKPOINTS = "checkpoints"
 """The folder of a run's checkpoints, in the run folder."""
+TRAINING_NAME = "training.yaml"
+"""The config of an exported agent's training, in its folder."""
 
 Settings = TypeVar("Settings")
 
@@ -96,21 +98,29 @@ def settings_of_run(folder: Path, *, key: str = "run") -> TrainingSettings:
     return _of_run(folder, key, _training_settings)
 
 
-def settings_driven_by(run: Path | None) -> TrainingSettings:
-    """Read what the agent of a run was trained with; for None, a baseline, training's defaults.
-
-    Which agent would be trained in that default world does not matter.
+def settings_of_export(folder: Path) -> TrainingSettings:
+    """Read what an exported agent was trained with.
 
     Raises:
-        UserInputError: as :func:`settings_of_run`.
+        UserInputError: if its folder does not say so, or this version cannot read it.
     """
-    return training_settings(compose("train", ["+algo=sac"])) if run is None else settings_of_run(run)
+    path = folder / TRAINING_NAME
+    if not path.is_file():
+        raise UserInputError(
+            f"{folder} holds no {TRAINING_NAME}, so nobody knows the world its agent was trained in: export it anew "
+            "with this version, or name its run folder"
+        )
+    return _of_file(path, _training_settings)
 
 
 def _of_run(folder: Path, key: str, reader: Callable[[dict[str, Any]], Settings]) -> Settings:
     path = folder / CONFIG_NAME
     if not os.path.isfile(path):  # false for a name that is too long, too
         raise UserInputError(f"{key}={folder} holds no {CONFIG_NAME}: name a folder that training wrote")
+    return _of_file(path, reader)
+
+
+def _of_file(path: Path, reader: Callable[[dict[str, Any]], Settings]) -> Settings:
     try:
         cfg = OmegaConf.load(path)
         if not isinstance(cfg, DictConfig):

@@ -1,7 +1,6 @@
 """Calibration: are the quantiles that critics have learnt true? Predictions against the returns of roll-outs."""
 
 import contextlib
-import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,20 +12,20 @@ from omegaconf import DictConfig
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import CalibrationSettings
-from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_of_run
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import measure_states
 from rcdsac_trl.evaluation.cross_evaluation import cross_evaluate, cross_tables
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
+from rcdsac_trl.release.named_agent import NamedAgent, named_agent
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
-from rcdsac_trl.rollout.make_agent import make_loss, packed_loss, unpacked_loss
+from rcdsac_trl.rollout.make_agent import packed_loss, unpacked_loss
 from rcdsac_trl.seeding import stream, torch_stream
-from rcdsac_trl.storage.checkpoint import load_weights
-from rcdsac_trl.storage.checkpoint_record import find
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.rules import RULES_VERSION
@@ -46,12 +45,15 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is None:
-        raise UserInputError("name the run whose critics are measured: run=<folder>")
-    folder = Path(settings.run)
-    trained = settings_of_run(folder)
+        raise UserInputError(
+            "name the agent whose critics are measured: run=<folder> of a run or an export, or a shipped agent"
+        )
+    named = named_agent(settings.run, settings.checkpoint)
+    trained = named.settings
     if trained.algo.critic != "quantile":
         raise UserInputError(
-            f"run={folder} has {trained.algo.critic} critics, which predict no quantiles: name a run of another row"
+            f"run={settings.run} has {trained.algo.critic} critics, which predict no quantiles: name an agent of "
+            "another row"
         )
     if not 0 < settings.horizon_steps < trained.task.episode_steps:
         raise UserInputError(
@@ -61,52 +63,52 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
     conditions = trained.algo.conditions(settings.beta, None)
     if settings.cross_evaluate and len(conditions) < 2:
         raise UserInputError(
-            f"cross_evaluate=true holds values of beta against each other, and {folder} is asked for one: give two or "
-            "more to a risk-conditioned agent, such as beta=[0.25,1], or leave cross_evaluate out"
+            f"cross_evaluate=true holds values of beta against each other, and {settings.run} is asked for one: give "
+            "two or more to a risk-conditioned agent, such as beta=[0.25,1], or leave cross_evaluate out"
         )
+    named.check()
+    loss = named.load_critics()
     processes = resolve_processes(settings.num_workers, settings.num_maps)
     simulations = max(1, processes) * len(conditions) * settings.num_states * settings.num_rollouts
     remedy = "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, or end other programs"
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
-    checkpoints = folder / CHECKPOINTS
-    find(checkpoints, settings.checkpoint)
 
-    def maps() -> Generator[Rows, None, None]:
-        loss = make_loss(trained, "cpu")
-        for damaged in load_weights(checkpoints, settings.checkpoint, loss=loss):
-            print(f"rcdsac_trl: {damaged}", file=sys.stderr)
+    def maps(watch: Watch) -> Generator[Rows, None, None]:
         make = partial(_driver, settings, trained, conditions, packed_loss(loss))
-        return evaluate_maps(make, settings.num_maps, processes)
+        return evaluate_maps(make, settings.num_maps, processes, watch)
 
     return MeasuredRun(
         kind="calibration",
-        out=_default_out(settings, folder, conditions) if settings.out is None else Path(settings.out),
-        described=_described(settings, trained, conditions),
+        out=_default_out(settings, named, conditions) if settings.out is None else Path(settings.out),
+        described=_described(settings, named, conditions),
         unit="map",
         num_units=settings.num_maps,
+        unit_steps=trained.task.episode_steps,
+        processes=processes,
         measure=maps,
         findings=partial(_findings, trained.algo.distortion.measure),
     )
 
 
-def _default_out(settings: CalibrationSettings, run: Path, conditions: Sequence[Condition]) -> Path:
-    name = f"{settings.checkpoint}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
+def _default_out(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition]) -> Path:
+    name = f"{named.stem}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}".removeprefix(
+        "-"
+    )
     if settings.cross_evaluate:
         name += "-cross"
-    return run / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
+    return named.out / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
 
 
-def _described(
-    settings: CalibrationSettings, trained: TrainingSettings, conditions: Sequence[Condition]
-) -> dict[str, Any]:
+def _described(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition]) -> dict[str, Any]:
     """Say what is measured and how."""
+    trained = named.settings
     described = {
         "agent": trained.algo.name,
         "measure": trained.algo.distortion.name,
         "sensor": trained.sensor.name,
         "memory_s": trained.sensor.memory_s,
         "train_seed": trained.seed,
-        "checkpoint": settings.checkpoint,
+        **named.described,
         "split": settings.split,
         "seed": settings.seed,
         "num_maps": settings.num_maps,

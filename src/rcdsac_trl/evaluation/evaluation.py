@@ -1,8 +1,7 @@
 """Evaluation: the same maps, starts and goals for every agent, deterministic actions, one row an episode."""
 
-import sys
 from collections.abc import Generator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -10,24 +9,25 @@ from typing import Any
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.config.evaluation_settings import EvaluationSettings, Name
-from rcdsac_trl.config.run_config import CHECKPOINTS, read_config, settings_driven_by
+from rcdsac_trl.config.evaluation_settings import EvaluationSettings
+from rcdsac_trl.config.named_folder import default_training
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
+from rcdsac_trl.release.named_agent import NamedAgent, named_agent
 from rcdsac_trl.rollout.collisions import COLLISIONS, collision_table
 from rcdsac_trl.rollout.evaluation_pool import Rows, evaluate_maps
-from rcdsac_trl.rollout.make_agent import make_average, make_loss, packed, packed_loss
+from rcdsac_trl.rollout.make_agent import packed, packed_loss
 from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
 from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS, table_of
 from rcdsac_trl.rollout.metrics import summarise
 from rcdsac_trl.rollout.planners.baselines import PURSUIT, check_baseline, settings_of
-from rcdsac_trl.storage.checkpoint import load_weights
-from rcdsac_trl.storage.checkpoint_record import find
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -45,7 +45,8 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     settings = read_config(cfg, EvaluationSettings)
     if settings.record:
         check_extra()
-    trained = settings_driven_by(None if settings.run is None else Path(settings.run))
+    named = None if settings.run is None else named_agent(settings.run, settings.checkpoint)
+    trained = default_training() if named is None else named.settings
     spec = _spec(settings, trained)
     if settings.baseline is not None:
         check_baseline(settings.baseline, spec.world.sensor)
@@ -53,16 +54,19 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     simulations = max(1, processes) * spec.world.num_agents
     remedy = "lower num_episodes or num_workers, or end other programs"
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
-    if settings.run is not None:
-        find(Path(settings.run) / CHECKPOINTS, settings.checkpoint)
+    if named is not None:
+        named.check()
 
     @cache  # Read once: a training that goes on may write another checkpoint meanwhile.
     def agent() -> Agent | None:
-        return None if settings.run is None else _read_agent(trained, Path(settings.run), settings.checkpoint)
+        if named is None:
+            return None
+        loss, average = named.load()
+        return Agent(packed(average.module), packed_loss(loss))
 
-    def maps() -> Generator[Rows, None, None]:
+    def maps(watch: Watch) -> Generator[Rows, None, None]:
         make = partial(map_evaluator, spec, *(agent() or (None,)))
-        return evaluate_maps(make, settings.num_maps, processes)
+        return evaluate_maps(make, settings.num_maps, processes, watch)
 
     def film(folder: Path, rows: Rows) -> list[Path]:
         headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in spec.conditions]
@@ -70,10 +74,12 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
 
     return MeasuredRun(
         kind="evaluation",
-        out=Path(settings.out) if settings.out is not None else _default_out(settings, spec),
-        described=_described(settings, spec),
+        out=Path(settings.out) if settings.out is not None else _default_out(settings, spec, named),
+        described=_described(settings, spec, named),
         unit="map",
         num_units=settings.num_maps,
+        unit_steps=spec.world.task.episode_steps,
+        processes=processes,
         measure=maps,
         findings=_findings,
         film=film if settings.record else None,
@@ -107,24 +113,24 @@ def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
     return trained.algo.name if settings.baseline is None else settings.baseline
 
 
-def _default_out(settings: EvaluationSettings, spec: EvaluationSpec) -> Path:
+def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None) -> Path:
     name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
-    if settings.run is None:
+    if named is None:
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
-    return Path(settings.run) / "evaluation" / f"{settings.checkpoint}-{name}{contexts}"
+    return named.out / "evaluation" / f"{named.stem}-{name}{contexts}".removeprefix("-")
 
 
-def _described(settings: EvaluationSettings, spec: EvaluationSpec) -> dict[str, Any]:
+def _described(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None) -> dict[str, Any]:
     """Say what is measured and how."""
-    trained, is_run = spec.trained, settings.run is not None
+    trained = spec.trained
     described = {
         "agent": _name(settings, trained),
-        "measure": trained.algo.distortion.name if is_run else None,
+        "measure": None if named is None else trained.algo.distortion.name,
         "sensor": spec.world.sensor,
         "memory_s": spec.world.memory_s,
-        "train_seed": trained.seed if is_run else None,
-        "checkpoint": settings.checkpoint if is_run else None,
+        "train_seed": None if named is None else trained.seed,
+        **({"checkpoint": None} if named is None else named.described),
         "split": settings.split,
         "seed": settings.seed,
         "num_maps": settings.num_maps,
@@ -155,20 +161,17 @@ def _findings(rows: Rows) -> Findings:
     )
 
 
-def _read_agent(trained: TrainingSettings, run: Path, checkpoint: Name) -> Agent:
-    loss = make_loss(trained, "cpu")
-    average = make_average(loss, trained.learner)
-    for damaged in load_weights(run / CHECKPOINTS, checkpoint, loss=loss, average=average):
-        print(f"rcdsac_trl: {damaged}", file=sys.stderr)
-    return Agent(packed(average.module), packed_loss(loss))
-
-
 def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, num_conditions: int) -> WorldSettings:
     maps, sensor, task = settings.world_of(trained)
-    if settings.run is not None and sensor != trained.sensor:
+    if settings.run is None:
+        sensor = replace(sensor, memory_s=0.0)  # baselines do not read what is remembered
+    # Who chooses the sensor's name alone chooses no memory.
+    elif sensor.name == trained.sensor.name and sensor.memory_s in (0.0, trained.sensor.memory_s):
+        sensor = trained.sensor
+    else:
         raise UserInputError(
-            f"sensor={sensor.name} does not fit: {settings.run} was trained with sensor={trained.sensor.name}, "
-            "leave it out"
+            f"sensor={sensor.name} sensor.memory_s={sensor.memory_s:g} does not fit: {settings.run} was trained with "
+            f"sensor={trained.sensor.name} sensor.memory_s={trained.sensor.memory_s:g}, leave both out"
         )
     return WorldSettings(
         map_settings=maps,

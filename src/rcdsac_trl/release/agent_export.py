@@ -6,12 +6,13 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.evaluation_settings import ExportSettings
-from rcdsac_trl.config.run_config import read_config
-from rcdsac_trl.deploy.export.exported import LIMIT, check_extra, differences, export_agent
+from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
+from rcdsac_trl.deploy.export.exported import LIMIT, betas_of, check_extra, differences, export_agent
 from rcdsac_trl.deploy.policy.weights import Weights, packed
 from rcdsac_trl.errors import FaultError, UserInputError
-from rcdsac_trl.release.run_weights import weights_of_run
+from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.storage import atomic
+from rcdsac_trl.system.progress import Work
 from rcdsac_trl.system.resources import check_writable
 
 
@@ -23,11 +24,13 @@ class Export:
         weights: of the agent.
         out: the folder that is written.
         num_quantiles: of the exported critics.
+        training: the config of its training, as a file, by which others can measure it again; None where nobody has it.
     """
 
     weights: Weights
     out: Path
     num_quantiles: int
+    training: bytes | None = None
 
     def run(self, *, steps: int = 1000) -> dict[str, float]:
         """Write the folder, unless a program differs from torch by more than the limit; return the differences.
@@ -38,8 +41,12 @@ class Export:
         Raises:
             FaultError: if one differs; nothing is written then.
         """
-        exported = export_agent(self.weights, self.num_quantiles)
-        found = differences(exported, self.weights, steps=steps)
+        betas = betas_of(self.weights)
+        with Work("two programs as ONNX and by torch.export", 1, "export"):
+            exported = export_agent(self.weights, self.num_quantiles)
+        doing = f"drives of {steps} steps with each program, compared with torch"
+        with Work(doing, len(betas), "drive") as work:
+            found = differences(exported, self.weights, betas=betas, steps=steps, work=work)
         for name, difference in found.items():
             print(f"{name:>12}: largest difference from torch {difference:.1e}")
         if not max(found.values()) <= LIMIT:
@@ -49,25 +56,26 @@ class Export:
             )
         self.out.mkdir(parents=True, exist_ok=True)
         # The config comes last: a folder that has one is complete.
-        for name, content in (exported.files | packed(self.weights)).items():
+        training = {} if self.training is None else {TRAINING_NAME: self.training}
+        for name, content in (exported.files | training | packed(self.weights)).items():
             atomic.write(self.out / name, content)
         print(f"wrote {self.out}")
         return found
 
 
 def make_export(cfg: DictConfig) -> Export:
-    """Make an export of a run; refuses before anything is written.
+    """Make an export of an agent; refuses before anything is written.
 
     Raises:
-        UserInputError: for a missing run or package, or a folder that holds something.
+        UserInputError: for a missing agent or package, or a folder that holds something.
     """
     settings = read_config(cfg, ExportSettings)
     check_extra()
     assert settings.run is not None
-    weights = weights_of_run(Path(settings.run), settings.checkpoint)
-    default_out = Path(settings.run) / "export" / str(settings.checkpoint)
-    out = default_out if settings.out is None else Path(settings.out)
+    agent = named_agent(settings.run, settings.checkpoint)
+    weights = agent.weights()
+    out = agent.out / "export" / agent.stem if settings.out is None else Path(settings.out)
     check_writable(out)
     if out.is_dir() and any(out.iterdir()):
         raise UserInputError(f"out={out} is not empty: choose another folder, or remove what is there")
-    return Export(weights, out, settings.num_quantiles)
+    return Export(weights, out, settings.num_quantiles, agent.training)

@@ -8,10 +8,11 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
-from rcdsac_trl.config.run_config import read_config
+from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy import Policy
 from rcdsac_trl.deploy.policy.weights import Weights, halved, packed
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.release.named_agent import RunAgent, named_agent
 from rcdsac_trl.release.run_weights import weights_of_run
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.seeding import stream
@@ -32,11 +33,13 @@ class Published:
     Attributes:
         run: folder of its run.
         weights: of its agent.
+        training: the config of its training, as a file.
         evaluation: folder of the evaluation that its card quotes.
     """
 
     run: Path
     weights: Weights
+    training: bytes
     evaluation: Path
 
 
@@ -73,7 +76,10 @@ class Publication:
                     target = self.results / name / path
                     target.parent.mkdir(parents=True, exist_ok=True)
                     atomic.write(target, (agent.run / path).read_bytes())
-            files = packed(small, half=True, results=f"{describe(agent.evaluation).strip()}\n\n{stored}")
+            # The config comes last here, too: a folder that has one is complete.
+            files = {TRAINING_NAME: agent.training} | packed(
+                small, half=True, results=f"{describe(agent.evaluation).strip()}\n\n{stored}"
+            )
             (self.weights / name).mkdir(parents=True, exist_ok=True)
             for file, content in files.items():
                 atomic.write(self.weights / name / file, content)
@@ -90,11 +96,17 @@ def make_publication(cfg: DictConfig) -> Publication:
     settings = read_config(cfg, PublishSettings)
     agents: dict[str, Published] = {}
     for run in map(Path, settings.runs):
+        agent = named_agent(run)
+        if not isinstance(agent, RunAgent):
+            raise UserInputError(
+                f"{run} is an agent that was exported, and what is published are the tables of its run, too: name the "
+                "run folder"
+            )
         weights = weights_of_run(run, settings.checkpoint)
         name = f"{weights.config.name}-{weights.config.sensor}"
         if name in agents:
             raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
-        agents[name] = Published(run, weights, _evaluation_of(run, settings.checkpoint))
+        agents[name] = Published(run, weights, agent.training, _evaluation_of(run, settings.checkpoint))
     for folder in (Path(settings.weights), Path(settings.results)):
         check_writable(folder)
         for name in agents:

@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import CHECKPOINTS, AgentOfRun, agent_of_run
+from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Context, Weights
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
@@ -20,7 +23,10 @@ from rcdsac_trl.storage.checkpoint_record import Progress
 # Where the parts lie in a checkpoint: in the running average of the actor, and in the loss.
 _ACTOR = "module.module.{}.module."
 _CRITIC = "critic_network_params.{}.module.{}.module."
+_LEARNING_ACTOR = "actor_network_params.module.{}.module."
 _PARTS = ("encoder", "head")
+TEMPERATURE = "temperature"
+"""Key of an agent's provenance: what a nat of entropy was worth to its critics, as a reward."""
 
 
 def weights_of_run(folder: Path, checkpoint: Name) -> Weights:
@@ -51,7 +57,9 @@ def weights_of_run(folder: Path, checkpoint: Name) -> Weights:
         encoder = _below(states["loss"], _CRITIC.format(num_critics, 0), f"critics.{num_critics}.encoder.")
         tensors |= encoder | head
         num_critics += 1
-    config = _config(agent, num_critics, _provenance(folder, checkpoint, saved.progress))
+    provenance = _provenance(folder, checkpoint, saved.progress)
+    provenance[TEMPERATURE] = float(states["loss"]["log_alpha"].exp())
+    config = agent_config(agent, num_critics, provenance)
     return Weights(config, {name: np.ascontiguousarray(tensor.numpy()) for name, tensor in tensors.items()})
 
 
@@ -61,7 +69,36 @@ def _below(state: Mapping[str, Tensor], prefix: str, new: str) -> dict[str, Tens
     return {new + name: value for name, value in found.items() if not name.startswith("cosines.")}
 
 
-def _config(agent: AgentOfRun, num_critics: int, provenance: dict[str, str | int | float | None]) -> AgentConfig:
+def states_of_weights(weights: Weights) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return an agent's tensors by their names in the states of a loss and of an averaged actor.
+
+    The loss gets the critics, and the averaged actor in place of the learning one.
+    """
+    loss: dict[str, Tensor] = {}
+    average: dict[str, Tensor] = {}
+    for number, part in enumerate(_PARTS):
+        for name, value in weights.part(f"actor.{part}").items():
+            average[_ACTOR.format(number) + name] = loss[_LEARNING_ACTOR.format(number) + name] = _tensor(value)
+        for critic in range(weights.config.num_critics):
+            for name, value in weights.part(f"critics.{critic}.{part}").items():
+                loss[_CRITIC.format(critic, number) + name] = _tensor(value)
+    return loss, average
+
+
+def _tensor(value: NDArray[np.float32]) -> Tensor:
+    return torch.from_numpy(value.copy())
+
+
+def agent_config(
+    agent: AgentOfRun | TrainingSettings, num_critics: int, provenance: Mapping[str, str | int | float | None]
+) -> AgentConfig:
+    """Return what one has to know of an agent to drive with it.
+
+    Args:
+        agent: what it is, or all that it was trained with.
+        num_critics: number of critics.
+        provenance: where it comes from.
+    """
     algo, task = agent.algo, agent.task
     context: Context | None = None
     context_range = None

@@ -7,6 +7,7 @@ from omegaconf import DictConfig
 
 from rcdsac_trl.cli import Command
 from rcdsac_trl.report.read import Episodes, read_episodes
+from rcdsac_trl.system.progress import Work
 from rcdsac_trl.system.resources import check_out
 
 
@@ -23,7 +24,10 @@ class Report:
         from rcdsac_trl.report import table
         from rcdsac_trl.report.write import write_report
 
-        write_report(self.episodes, self.folders, self.out)
+        conditions, episodes = len(self.episodes.conditions), len(self.episodes.table)
+        doing = f"statistics and figures of {conditions} conditions, {episodes} episodes, for {self.out}"
+        with Work(doing, 1, "report"):
+            write_report(self.episodes, self.folders, self.out)
         print(table.flattened(table.comparison(self.episodes)).to_string(index=False))
         print(f"written to {self.out}")
 

@@ -4,6 +4,7 @@ An evaluation waits for them (:func:`evaluate_maps`), a training goes on meanwhi
 """
 
 import contextlib
+import itertools
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager
 from typing import Any
@@ -13,6 +14,7 @@ from rcdsac_trl.system import process_pool
 from rcdsac_trl.system.interrupts import interruption_point
 from rcdsac_trl.system.process_pool import ProcessPool
 from rcdsac_trl.system.processes import WorkerError
+from rcdsac_trl.system.progress import Watch
 
 Rows = list[dict[str, Any]]
 Drive = Callable[[int, Callable[[], None]], Rows]
@@ -67,16 +69,17 @@ class EvaluationPool:
         if (map_index := next(self._waiting, None)) is not None:
             self._pool.send(number, map_index)
 
-    def receive(self, *, until_done: bool) -> Generator[Rows, None, None]:
+    def receive(self, *, until_done: bool, watch: Watch | None = None) -> Generator[Rows, None, None]:
         """Yield the rows of every map that is done and was not yielded before, in any order.
 
         Args:
             until_done: wait for the maps that are not done; else yield what there is.
+            watch: told the steps driven so far, while one waits.
 
         Raises:
             WorkerError: if a process ends before its work does, or hangs.
         """
-        for number, rows in self._pool.answers(until_done=until_done):
+        for number, rows in self._pool.answers(until_done=until_done, watch=watch):
             self._give(number)
             yield rows
 
@@ -85,8 +88,12 @@ class EvaluationPool:
         self._pool.close()
 
 
+def _nobody(steps: int) -> None:
+    """Watch nothing."""
+
+
 def evaluate_maps(
-    make: Callable[[], AbstractContextManager[Drive]], num_maps: int, processes: int
+    make: Callable[[], AbstractContextManager[Drive]], num_maps: int, processes: int, watch: Watch = _nobody
 ) -> Generator[Rows, None, None]:
     """Drive maps 0, 1, ... and yield the rows of each as it is done, in any order.
 
@@ -94,16 +101,23 @@ def evaluate_maps(
         make: makes what drives; called once in every process that drives, so with processes it must pickle.
         num_maps: how many maps.
         processes: from :func:`rcdsac_trl.system.processes.resolve_processes`; 0: this one drives.
+        watch: told the steps driven so far.
 
     Raises:
         FaultError: if a process ends before its work does; it has written why to stderr.
     """
     if processes == 0:
+        steps = itertools.count(1)
+
+        def before_step() -> None:
+            interruption_point()
+            watch(next(steps))
+
         with make() as drive:
-            yield from (drive(map_index, interruption_point) for map_index in range(num_maps))
+            yield from (drive(map_index, before_step) for map_index in range(num_maps))
         return
     with contextlib.closing(EvaluationPool(make, num_maps, processes)) as pool:
         try:
-            yield from pool.receive(until_done=True)
+            yield from pool.receive(until_done=True, watch=watch)
         except WorkerError as error:
-            raise FaultError(f"{error}: nothing is written, start again") from error
+            raise FaultError(f"{error}: start again") from error

@@ -1,5 +1,8 @@
 """Ctrl-C where it can be served: between two updates or two steps, not inside compiled code.
 
+SIGTERM, by which supervisors and clusters end a program, and SIGHUP, by which a terminal that closes does, are served
+in the same way.
+
 Python raises ``KeyboardInterrupt`` wherever it happens to be. Inside a callback of compiled code it is lost, or comes
 out as a ``SystemError``: about one training in ten then ended with a traceback, or did not end.
 """
@@ -11,6 +14,33 @@ from contextlib import contextmanager
 from types import FrameType
 
 _pressed = threading.Event()
+_ENDINGS = (signal.SIGTERM, signal.SIGHUP)
+_last: signal.Signals = signal.SIGINT
+
+
+@contextmanager
+def endings_as_interrupts() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP do what Ctrl-C does; one that is ignored, or served by somebody, stays so.
+
+    Outside the main thread nothing changes.
+    """
+    global _last
+    _last = signal.SIGINT
+    served = []
+    if threading.current_thread() is threading.main_thread():
+        served = [number for number in _ENDINGS if signal.getsignal(number) is signal.SIG_DFL]
+    for number in served:
+        signal.signal(number, _interrupt)
+    try:
+        yield
+    finally:
+        for number in served:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def ended_by() -> signal.Signals:
+    """Return the signal of the latest interrupt: SIGINT, unless another was served as one."""
+    return _last
 
 
 @contextmanager
@@ -34,6 +64,16 @@ def at_safe_points() -> Iterator[None]:
 def interruption_point() -> None:
     """Raise ``KeyboardInterrupt`` if Ctrl-C was pressed."""
     if _pressed.is_set():
+        raise KeyboardInterrupt
+
+
+def _interrupt(signal_number: int, frame: FrameType | None) -> None:
+    global _last
+    _last = signal.Signals(signal_number)
+    serve = signal.getsignal(signal.SIGINT)
+    if callable(serve):
+        serve(signal_number, frame)
+    else:  # a shell lets what it starts in the background ignore Ctrl-C
         raise KeyboardInterrupt
 
 

@@ -13,6 +13,7 @@ from typing import Any, cast
 
 from rcdsac_trl.system.interrupts import interruption_point
 from rcdsac_trl.system.processes import START_METHOD, WorkerError, check_may_start_processes, ending
+from rcdsac_trl.system.progress import Watch
 
 Serve = Callable[[Any, Callable[[], None]], Any]
 """Answers a request; calls its second argument before every step, which shows that it does not hang."""
@@ -98,11 +99,12 @@ class ProcessPool:
             self._connections[number].send(request)
         self._open_requests[number] += 1
 
-    def answers(self, *, until_done: bool) -> Iterator[tuple[int, Any]]:
+    def answers(self, *, until_done: bool, watch: Watch | None = None) -> Iterator[tuple[int, Any]]:
         """Yield number of the process and answer, for every request that is answered, in any order.
 
         Args:
             until_done: wait for all requests, also those that are sent meanwhile; else yield what there is.
+            watch: told the steps of all processes while one waits.
 
         Raises:
             WorkerError: if a process ends before its work does, or hangs.
@@ -124,6 +126,8 @@ class ProcessPool:
                 else:
                     self._check_steps(number)
             interruption_point()
+            if watch is not None:
+                watch(sum(steps.value for steps in self._steps))
 
     def _check_steps(self, number: int) -> None:
         now_s, (seen, seen_s) = time.monotonic(), self._seen[number]
@@ -144,6 +148,7 @@ class ProcessPool:
             yield
         except (EOFError, OSError) as error:
             self.processes[number].join()
+            interruption_point()  # what supervisors send goes to all processes: then this is no fault
             raise self._error(number) from error
         finally:
             if timer is not None:

@@ -63,10 +63,13 @@ def quiet_libraries() -> None:
 
 
 def speak_anywhere() -> None:
-    """Let what a program prints reach a terminal that has no letter for it, such as a β where the locale is C."""
+    """Let what a program prints be read wherever it goes, and when it is printed.
+
+    A terminal may have no letter for it, such as a β where the locale is C; a pipe or a file would get it at the end.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+            stream.reconfigure(errors="backslashreplace", line_buffering=True)
 
 
 def let_workers_rest() -> None:

@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from rcdsac_trl.system.interrupts import ended_by
+
 _PR_SET_PDEATHSIG = 1
 _PATIENCE_S = 60
 _POLL_S = 1.0
@@ -64,7 +66,9 @@ def _watch(process: subprocess.Popen[bytes], should_stop: Callable[[], bool]) ->
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Wait for a process that had the same Ctrl-C; end it if it did not stop by that."""
+    """Wait for a process that had the same Ctrl-C; end it if it did not stop by that, or had none."""
+    if ended_by() is not signal.SIGINT:  # what a supervisor sends goes to one process
+        process.terminate()
     try:
         process.wait(timeout=_PATIENCE_S)
     except subprocess.TimeoutExpired:

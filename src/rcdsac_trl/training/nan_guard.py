@@ -35,17 +35,17 @@ class FiniteGuard:
         self.folder = folder / "failure"
         self.loss = loss
         self.optimizer = optimizer
-        self._iteration = 0
-        self._update = 0
+        self._iteration = 1
+        self._update = 1
         self._failed: Tensor | None = None
         loss.register_forward_pre_hook(self._remember_input)
         loss.register_forward_hook(self._remember_losses)
         optimizer.register_step_pre_hook(self._check_update)
 
     def start_iteration(self, iteration: int) -> None:
-        """Say which iteration it is, for messages."""
-        self._iteration = iteration
-        self._update = 0
+        """Say which iteration it is, from 0; messages and folders count it, and its updates, from 1 as the log does."""
+        self._iteration = iteration + 1
+        self._update = 1
         self._failed = None
 
     def check_episodes(self, episodes: TensorDictBase) -> None:

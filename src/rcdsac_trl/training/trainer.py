@@ -83,6 +83,7 @@ class Trainer:
         self.lock = lock
         self.context_key = context_key
         self.on_iteration_end = on_iteration_end
+        self._iteration = progress.iterations  # under way, from 0
 
     def run(self) -> None:
         """Train to the end of the schedule; what is done after the last checkpoint is lost if it ends early.
@@ -97,7 +98,7 @@ class Trainer:
             reason = f" ({stop})" if str(stop) else ""
             self.log.message(f"stopped after {self.progress.iterations} iterations{reason}; {self._saved_sentence()}")
         except KeyboardInterrupt:
-            self.log.message(f"interrupted in iteration {self.progress.iterations}; {self._saved_sentence()}")
+            self.log.message(f"interrupted {self._where()}; {self._saved_sentence()}")
             raise
         except TrainingError as error:
             self.log.message(str(error))
@@ -105,7 +106,7 @@ class Trainer:
         except Exception as error:
             if (sentence := fault_sentence(error)) is None:
                 raise
-            sentence = f"{sentence}: training stops in iteration {self.progress.iterations}; {self._saved_sentence()}"
+            sentence = f"{sentence}: training stops {self._where()}; {self._saved_sentence()}"
             with contextlib.suppress(OSError):  # the log may be on the same disk
                 self.log.message(sentence)
             raise TrainingError(sentence) from error
@@ -124,6 +125,7 @@ class Trainer:
         self.progress = self.validation.go_on(self.progress)
         with tqdm(total=total, initial=self.progress.iterations, unit="it", disable=None, smoothing=0.1) as bar:
             for iteration in range(self.progress.iterations, total):
+                self._iteration = iteration
                 record = self._iterate(iteration)
                 self.progress = replace(self.progress, iterations=iteration + 1)
                 self.progress = self.validation.after_iteration(self.progress, self.learner.averaged_actor)
@@ -145,10 +147,7 @@ class Trainer:
             raise
         except Exception as error:
             what = " ".join(f"{type(error).__name__}: {error}".split())
-            self.log.message(
-                f"on_iteration_end failed in iteration {self.progress.iterations - 1} ({what}); "
-                f"{self._saved_sentence()}"
-            )
+            self.log.message(f"on_iteration_end failed {self._where()} ({what}); {self._saved_sentence()}")
             raise
 
     def _iterate(self, iteration: int) -> dict[str, float]:
@@ -188,10 +187,10 @@ class Trainer:
             try:
                 return self.episodes.collect(iteration, map_index)
             except WorkerError as error:
-                self.restarts.spend(f"iteration {iteration}, training map {map_index}", error)
+                self.restarts.spend(f"iteration {iteration + 1}, training map {map_index}", error)
                 self.progress = replace(self.progress, skipped_maps=self.progress.skipped_maps + 1)
                 self.log.message(
-                    f"the episodes on map {map_index} are dropped: iteration {iteration} drives on the next"
+                    f"the episodes on map {map_index} are dropped: iteration {iteration + 1} drives on the next"
                 )
 
     def _is_saved_now(self) -> bool:
@@ -204,6 +203,10 @@ class Trainer:
     def _save(self) -> None:
         self.progress = replace(self.progress, restarts=self.restarts.used)
         self.checkpoints.save(self.progress, self.log.lengths())
+
+    def _where(self) -> str:
+        """Name the iteration that is under way as the log's lines do, from 1."""
+        return f"in iteration {self._iteration + 1}"
 
     def _saved_sentence(self) -> str:
         return saved_sentence(self.checkpoints, self.log)

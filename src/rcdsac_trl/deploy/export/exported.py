@@ -9,7 +9,7 @@ import importlib.util
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,7 @@ from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, REMEMBERED_SIZE, vector_observations
 from rcdsac_trl.robot.range_sensor import NUM_BINS, sensor_mask
+from rcdsac_trl.system.progress import Work
 
 LIMIT = 1e-5
 """How far results may be from torch's: absolute; of quantiles, relative to the largest if that is beyond 1."""
@@ -95,24 +96,32 @@ def export_agent(weights: Weights, num_quantiles: int = 16) -> Exported:
     return Exported(files, {name: (pair[0], pair[1]) for name, pair in runners.items()})
 
 
-def differences(exported: Exported, weights: Weights, *, steps: int = 1000, num_betas: int = 5) -> dict[str, float]:
+def betas_of(weights: Weights, num_betas: int = 5) -> list[float]:
+    """Return a grid over the trained range of ``beta``, its ends included; one number where there is no range."""
+    low, high = weights.config.context_range or (0.0, 0.0)
+    grid: list[float] = np.linspace(low, high, num_betas if high > low else 1).tolist()
+    return grid
+
+
+def differences(
+    exported: Exported, weights: Weights, *, betas: Sequence[float], steps: int = 1000, work: Work | None = None
+) -> dict[str, float]:
     """Return the largest difference of each kind of program from torch, each with a memory of its own.
 
-    Every ``beta`` of a grid over the trained range is driven for a whole drive. Differences count
-    absolutely, those of quantiles relative to the largest of them if that is beyond 1.
+    Differences count absolutely, those of quantiles relative to the largest of them if that is beyond 1.
 
     Args:
         exported: from :func:`export_agent`.
         weights: of the agent.
+        betas: a whole drive for each.
         steps: of a drive.
-        num_betas: values of the grid, its ends included.
+        work: is told how far the drives are.
     """
-    low, high = weights.config.context_range or (0.0, 0.0)
-    grid = np.linspace(low, high, num_betas if high > low else 1)
     largest = {name: 0.0 for name in exported.runners if name != "torch"}
-    for number, context in enumerate(grid.tolist()):
+    for number, context in enumerate(betas):
         memories = {name: _memory(weights) for name in exported.runners}
-        for observed in _observations(weights, context, steps, seed=number):
+        drive = _observations(weights, context, steps, seed=number)
+        for observed in drive if work is None else work.within(drive, steps):
             expected: dict[str, Array] = {}
             for name, (actor, critics) in exported.runners.items():
                 found, memories[name] = _step(actor, critics, observed, memories[name])
@@ -122,6 +131,8 @@ def differences(exported: Exported, weights: Weights, *, steps: int = 1000, num_
                         # Quantiles are sums of terms as large as the largest of them, rounded as those are.
                         scale = max(1.0, float(np.abs(expected[key]).max()))
                         largest[name] = max(largest[name], float(np.abs(value - expected[key]).max()) / scale)
+        if work is not None:
+            work.end_unit()
     return largest
 
 

@@ -1,7 +1,8 @@
 """A trained agent as files: a folder of weights, what they are, and a model card.
 
 A weights folder holds ``weights.safetensors`` (the actor's and every critic's layers, float32), ``config.json``
-(:class:`AgentConfig`, and the SHA-256 of the weights) and ``README.md``. Nothing in it is code, and reading it needs
+(:class:`AgentConfig`, and the SHA-256 of the weights) and ``README.md``; beside them lies ``training.yaml``, the config
+of its training, which a robot does not read. Nothing in it is code, and reading it needs
 neither torch nor the configuration that trained it. ``python -m rcdsac_trl.export`` writes it.
 """
 
@@ -233,11 +234,12 @@ def find_weights(name_or_folder: str | Path, shipped: Path = SHIPPED) -> Path:
     for candidate in (folder, shipped / str(name_or_folder)):
         if (candidate / CONFIG_NAME).is_file():
             return candidate
-    if folder.is_dir():
-        raise UserInputError(f"{folder} holds no {CONFIG_NAME}: name a folder that rcdsac_trl.export wrote")
     names = shipped_names(shipped)
     there = f"shipped are {', '.join(names)}" if names else "none is shipped with this version"
-    raise UserInputError(f"there is no agent {str(name_or_folder)!r}: {there}; or name a folder")
+    others = "or name a run folder or one that rcdsac_trl.export wrote"
+    if folder.is_dir():
+        raise UserInputError(f"{folder} holds neither checkpoints nor {CONFIG_NAME}: {there}; {others}")
+    raise UserInputError(f"there is no agent {str(name_or_folder)!r}: {there}; {others}")
 
 
 def read_weights(folder: Path) -> Weights:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -10,7 +11,6 @@ from typing import Any
 
 import pandas as pd
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from rcdsac_trl.config.course_settings import PERIOD_S, CourseSettings
 from rcdsac_trl.config.run_config import read_config
@@ -31,11 +31,15 @@ from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.system.progress import Watch, Work, counted
 from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.maps.shapes import Box
 from rcdsac_trl.world.office.building import COURSE_M, Office, make_office
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.rules import RULES_VERSION
+
+# Of an agent on the course, for a guess of how long a run will take.
+_USUAL_SPEED_M_PER_S = 0.45
 
 
 @dataclass(frozen=True)
@@ -77,8 +81,9 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, "lower num_workers")
     conditions = Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed)
 
-    def drives() -> Generator[Rows, None, None]:
-        return evaluate_maps(partial(_driver, entries, jobs, conditions, settings.record), len(jobs), processes)
+    def drives(watch: Watch) -> Generator[Rows, None, None]:
+        make = partial(_driver, entries, jobs, conditions, settings.record)
+        return evaluate_maps(make, len(jobs), processes, watch)
 
     return MeasuredRun(
         kind="course",
@@ -86,6 +91,8 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
         described=_described(settings, entries),
         unit="run",
         num_units=len(jobs),
+        unit_steps=math.ceil(min(COURSE_M / _USUAL_SPEED_M_PER_S, settings.time_limit_s) / PERIOD_S),
+        processes=processes,
         measure=drives,
         findings=_findings,
         film=partial(_films, entries) if settings.record else None,
@@ -162,13 +169,16 @@ def _films(entries: Sequence[Entry], folder: Path, rows: Rows) -> list[Path]:
     office = make_office()
     kept = sorted((row for row in rows if "trace" in row), key=lambda row: row["number"])
     files = []
-    for row in tqdm(kept, unit="film", disable=None):
-        job, trace = row["job"], row["trace"]
-        entry = entries[job.entry]
-        title = f"{entry.name}, {job.direction}{'' if trace.finished else ', not finished'}"
-        stem = f"{job.entry}-{entry.name}-{job.direction}".replace(" ", "-")
-        course = course_of(office, job.direction)
-        files += write_video(frames(office, entry.pilot, trace, course, title), folder / stem, FPS)
+    with Work(f"{counted(len(kept), 'film')}, for {folder}", len(kept), "film") as work:
+        for row in kept:
+            job, trace = row["job"], row["trace"]
+            entry = entries[job.entry]
+            title = f"{entry.name}, {job.direction}{'' if trace.finished else ', not finished'}"
+            stem = f"{job.entry}-{entry.name}-{job.direction}".replace(" ", "-")
+            course = course_of(office, job.direction)
+            pictures = work.within(frames(office, entry.pilot, trace, course, title), len(trace.commands))
+            files += write_video(pictures, folder / stem, FPS)
+            work.end_unit()
     return files
 
 

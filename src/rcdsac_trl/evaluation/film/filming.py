@@ -1,12 +1,12 @@
 """A film of an evaluation's episodes, and a picture of their trajectories."""
 
 import io
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
 from tensordict.nn import TensorDictModuleBase
-from tqdm import tqdm
 
 from rcdsac_trl.config.evaluation_settings import VideoSettings
 from rcdsac_trl.evaluation.film.episode_film import Track, film
@@ -19,7 +19,8 @@ from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluato
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
 from rcdsac_trl.rollout.worker import RolloutWorker
 from rcdsac_trl.storage import atomic
-from rcdsac_trl.system.interrupts import interruption_point
+from rcdsac_trl.system.interrupts import at_safe_points, interruption_point
+from rcdsac_trl.system.progress import Work
 from rcdsac_trl.world.task.episode import draw_motor_steps
 
 
@@ -43,9 +44,10 @@ def write_film(
     tracks = recorded(spec, agent, video.map, video.episode)
     motor_steps = draw_motor_steps(spec.world.task, spec.split, spec.seed, video.map, video.episode)
     named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]
-    frames = tqdm(film(named, motor_steps * MOTOR_PERIOD_S), total=len(tracks[0]), unit="frame", disable=None)
     name = f"map{video.map}-episode{video.episode}"
-    films = write_video(frames, folder / f"video-{name}", video.fps)
+    with Work(f"a film of {len(tracks[0])} steps", 1, "film") as work:
+        frames = work.within(film(named, motor_steps * MOTOR_PERIOD_S), len(tracks[0]))
+        films = write_video(frames, folder / f"video-{name}", video.fps)
     picture = io.BytesIO()
     Image.fromarray(trajectories(named)).save(picture, "png", optimize=True)
     atomic.write(folder / f"ways-{name}.png", picture.getvalue())
@@ -65,6 +67,16 @@ def recorded(spec: EvaluationSpec, agent: Agent | None, map_index: int, episode:
         return watching[0]
 
     actor, loss = (None, None) if agent is None else agent
-    with map_evaluator(spec, actor, loss, wrap=watch) as drive:
-        drive(map_index, interruption_point)
+    steps = itertools.count(1)
+    with (
+        at_safe_points(),
+        map_evaluator(spec, actor, loss, wrap=watch) as drive,
+        Work(f"map {map_index} once more, for the film", 1, "map") as work,
+    ):
+
+        def before_step() -> None:
+            interruption_point()
+            work.reach(next(steps) / spec.world.task.episode_steps)
+
+        drive(map_index, before_step)
     return watching[0].tracks

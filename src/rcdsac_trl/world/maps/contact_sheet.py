@@ -1,5 +1,7 @@
 """Maps on a contact sheet, each with one start and goal and the paths between them."""
 
+from collections.abc import Callable
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -24,7 +26,9 @@ _PANEL_INCHES = 3.6
 _DOTS = (0, (1.0, 1.2))
 
 
-def contact_sheet(settings: MapSettings, split: Split, seed: int, count: int) -> Figure:
+def contact_sheet(
+    settings: MapSettings, split: Split, seed: int, count: int, *, drawn: Callable[[], None] = lambda: None
+) -> Figure:
     """Return a figure with the first maps of a family.
 
     Args:
@@ -32,6 +36,7 @@ def contact_sheet(settings: MapSettings, split: Split, seed: int, count: int) ->
         split: which family.
         seed: the root seed of the maps, starts and goals.
         count: how many maps.
+        drawn: called after each map.
     """
     columns = min(count, 4)
     rows = -(-count // columns)
@@ -42,6 +47,7 @@ def contact_sheet(settings: MapSettings, split: Split, seed: int, count: int) ->
         axes = figure.add_subplot(rows, columns, index + 1)
         axes.set_title(f"{split} {index} · {map_.layout}", fontsize=9, color=_WALL)
         draw_map(axes, map_, Planner(map_), stream(seed, f"draw/{split}", index))
+        drawn()
     figure.legend(handles=_legend(), loc="outside lower center", ncols=2 * min(columns, 2), frameon=False)
     return figure
 

@@ -1,0 +1,62 @@
+"""Which folder ``run=`` names, and what its agent was trained with; without torch."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.run_config import (
+    CHECKPOINTS,
+    CONFIG_NAME,
+    settings_of_export,
+    settings_of_run,
+    training_settings,
+)
+from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.deploy.policy.weights import find_weights
+from rcdsac_trl.errors import UserInputError
+
+
+@dataclass(frozen=True)
+class NamedFolder:
+    """The folder of a trained agent.
+
+    Attributes:
+        path: where it is.
+        is_run: whether training wrote it; else it holds an exported agent.
+    """
+
+    path: Path
+    is_run: bool
+
+    def settings(self) -> TrainingSettings:
+        """Read what the agent was trained with.
+
+        Raises:
+            UserInputError: if nothing says so, or this version cannot read it.
+        """
+        return settings_of_run(self.path) if self.is_run else settings_of_export(self.path)
+
+
+def find_agent(named: str | Path) -> NamedFolder:
+    """Return the folder of a name: of a run, one that ``export`` wrote, or that of an agent that is shipped.
+
+    A run folder comes first, then a weights folder, then a shipped agent.
+
+    Raises:
+        UserInputError: if there is none.
+    """
+    folder = Path(named)
+    if os.path.isdir(folder / CHECKPOINTS):  # false for a name that is too long, too
+        return NamedFolder(folder, is_run=True)
+    try:
+        return NamedFolder(find_weights(named), is_run=False)
+    except UserInputError:
+        if not os.path.isfile(folder / CONFIG_NAME):
+            raise
+    return NamedFolder(folder, is_run=True)
+
+
+def default_training() -> TrainingSettings:
+    """Return training's defaults: baselines drive in their world, whichever agent would be trained there."""
+    return training_settings(compose("train", ["+algo=sac"]))

@@ -1,0 +1,234 @@
+"""The agent that ``run=`` names, for every command that takes one: of a run folder, exported, or shipped."""
+
+import math
+import sys
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.optim.swa_utils import AveragedModel
+from torchrl.objectives import LossModule
+
+from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.named_folder import find_agent
+from rcdsac_trl.config.run_config import (
+    CHECKPOINTS,
+    CONFIG_NAME,
+    TRAINING_NAME,
+    settings_of_export,
+    settings_of_run,
+)
+from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.deploy.policy.weights import SHIPPED, WEIGHTS_NAME, Weights, read_weights
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.release.run_weights import TEMPERATURE, agent_config, states_of_weights, weights_of_run
+from rcdsac_trl.rollout.make_agent import make_average, make_loss
+from rcdsac_trl.storage.checkpoint import load_weights
+from rcdsac_trl.storage.checkpoint_record import find
+
+
+class NamedAgent(ABC):
+    """A trained agent, wherever it lies."""
+
+    @property
+    @abstractmethod
+    def settings(self) -> TrainingSettings:
+        """What it was trained with.
+
+        Raises:
+            UserInputError: if nothing says so.
+        """
+
+    @property
+    @abstractmethod
+    def described(self) -> dict[str, Any]:
+        """Which agent it is, for the descriptions of results."""
+
+    @property
+    @abstractmethod
+    def out(self) -> Path:
+        """The folder below which results go unless a user says otherwise."""
+
+    @property
+    @abstractmethod
+    def stem(self) -> str:
+        """What tells its results from those of others in that folder; may be empty."""
+
+    @property
+    @abstractmethod
+    def training(self) -> bytes | None:
+        """The config of its training, as a file; None where there is none."""
+
+    @abstractmethod
+    def weights(self) -> Weights:
+        """Read it as a robot does."""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Refuse, before work starts, what cannot be loaded."""
+
+    @abstractmethod
+    def load(self) -> tuple[LossModule, AveragedModel]:
+        """Load the loss with its actor and critics, and the averaged actor, which is what drives."""
+
+    @abstractmethod
+    def load_critics(self) -> LossModule:
+        """Load the loss with what its critics are about: the actor whose returns they predict, and the temperature.
+
+        Raises:
+            UserInputError: if the temperature is not known.
+        """
+
+
+@dataclass(frozen=True)
+class RunAgent(NamedAgent):
+    """The agent of a run at a checkpoint."""
+
+    folder: Path
+    checkpoint: Name
+
+    @cached_property
+    def settings(self) -> TrainingSettings:
+        """What it was trained with."""
+        return settings_of_run(self.folder)
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Its checkpoint."""
+        return {"checkpoint": self.checkpoint}
+
+    @property
+    def out(self) -> Path:
+        """The run folder."""
+        return self.folder
+
+    @property
+    def stem(self) -> str:
+        """The checkpoint."""
+        return str(self.checkpoint)
+
+    @property
+    def training(self) -> bytes:
+        """The run's config."""
+        return (self.folder / CONFIG_NAME).read_bytes()
+
+    def weights(self) -> Weights:
+        """Read the averaged actor and the critics."""
+        return weights_of_run(self.folder, self.checkpoint)
+
+    def check(self) -> None:
+        """Refuse a checkpoint that is not there, or damaged."""
+        find(self.folder / CHECKPOINTS, self.checkpoint)
+
+    def load(self) -> tuple[LossModule, AveragedModel]:
+        """Load both from the checkpoint."""
+        loss = make_loss(self.settings, "cpu")
+        average = make_average(loss, self.settings.learner)
+        for damaged in load_weights(self.folder / CHECKPOINTS, self.checkpoint, loss=loss, average=average):
+            print(f"rcdsac_trl: {damaged}", file=sys.stderr)
+        return loss, average
+
+    def load_critics(self) -> LossModule:
+        """Load the loss as training left it."""
+        return self.load()[0]
+
+
+@dataclass(frozen=True)
+class ExportedAgent(NamedAgent):
+    """An agent of a weights folder: exported, or shipped with the package."""
+
+    folder: Path
+    read: Weights
+
+    @cached_property
+    def settings(self) -> TrainingSettings:
+        """What it was trained with."""
+        settings = settings_of_export(self.folder)
+        config = self.read.config
+        if agent_config(settings, settings.learner.num_critics, config.provenance) != config:
+            raise UserInputError(f"{self.folder}: {TRAINING_NAME} is of another agent than the weights: export it anew")
+        return settings
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Of which checkpoint it is, and the weights' digest: the name stays, another version ships other weights."""
+        digest = sha256((self.folder / WEIGHTS_NAME).read_bytes()).hexdigest()
+        return {"checkpoint": self.read.config.provenance.get("checkpoint"), "weights_sha256": digest}
+
+    @property
+    def out(self) -> Path:
+        """Its folder; for a shipped one, which lies in the package, where the user is."""
+        return Path() if self._is_shipped else self.folder
+
+    @property
+    def stem(self) -> str:
+        """The name of a shipped one; a folder needs none."""
+        return self.folder.name if self._is_shipped else ""
+
+    @property
+    def _is_shipped(self) -> bool:
+        return self.folder.resolve().parent == SHIPPED
+
+    @property
+    def training(self) -> bytes | None:
+        """What was exported with it."""
+        path = self.folder / TRAINING_NAME
+        return path.read_bytes() if path.is_file() else None
+
+    def weights(self) -> Weights:
+        """Return what was read."""
+        return self.read
+
+    def check(self) -> None:
+        """Do nothing: it was read as a whole."""
+
+    def load(self) -> tuple[LossModule, AveragedModel]:
+        """Load both; the averaged actor, which is the only one here, stands for the learning one as well."""
+        loss = make_loss(self.settings, "cpu")
+        average = make_average(loss, self.settings.learner)
+        of_loss, of_average = states_of_weights(self.read)
+        loss.load_state_dict(loss.state_dict() | of_loss)
+        average.load_state_dict(average.state_dict() | of_average)
+        return loss, average
+
+    def load_critics(self) -> LossModule:
+        """Load the critics, the averaged actor and the temperature that the export has written down."""
+        temperature = self.read.config.provenance.get(TEMPERATURE)
+        if not isinstance(temperature, int | float) or not 0.0 < temperature < math.inf:
+            raise UserInputError(
+                f"{self.folder} does not say at which temperature its critics were trained, which the returns that "
+                "they predict depend on: export the agent anew, or name its run folder"
+            )
+        loss, _ = self.load()
+        with torch.no_grad():
+            loss.log_alpha.fill_(math.log(temperature))
+        return loss
+
+
+def named_agent(named: str | Path, checkpoint: Name | None = None) -> NamedAgent:
+    """Return the agent of a name: a run folder, a folder that ``export`` wrote, or an agent that is shipped.
+
+    See :func:`~rcdsac_trl.config.named_folder.find_agent`.
+
+    Args:
+        named: what the user says.
+        checkpoint: of a run, ``"best"`` where it is None; an exported agent is of one checkpoint, and has no choice.
+
+    Raises:
+        UserInputError: if there is no such agent, or its weights cannot be read.
+    """
+    found = find_agent(named)
+    if found.is_run:
+        return RunAgent(found.path, "best" if checkpoint is None else checkpoint)
+    weights = read_weights(found.path)
+    own = weights.config.provenance.get("checkpoint")
+    if checkpoint not in (None, own):
+        raise UserInputError(
+            f"checkpoint={checkpoint} chooses among those of a run, and run={named} is one agent, of checkpoint "
+            f"{own}: leave it out"
+        )
+    return ExportedAgent(found.path, weights)
