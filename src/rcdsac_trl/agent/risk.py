@@ -98,7 +98,7 @@ class RiskMeasure(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has no closed-form dual density")
 
-    def inverse_psi(self, u: Tensor, beta: Tensor) -> Tensor:
+    def inverse_psi(self, u: "Tensor", beta: "Tensor") -> "Tensor":
         r"""Return :math:`g(u) = \psi^{-1}(u)`, the weight of all quantiles at fractions up to ``u``.
 
         So the value of a sample :math:`x_{(1)} \le \dots \le x_{(n)}` is, exactly,
@@ -112,10 +112,13 @@ class RiskMeasure(ABC):
         Returns:
             float64, to its precision.
 
+            >>> import torch
         Example:
             >>> CVaR().inverse_psi(torch.tensor([0.0, 0.25, 0.5, 1.0]), torch.tensor(0.5)).diff()
             tensor([0.5000, 0.5000, 0.0000], dtype=torch.float64)
         """
+        import torch
+
         u, beta = torch.broadcast_tensors(u.double(), beta.double())
         low, high = torch.zeros_like(u), torch.ones_like(u)
         for _ in range(_HALVINGS):
