@@ -112,8 +112,8 @@ class RiskMeasure(ABC):
         Returns:
             float64, to its precision.
 
-            >>> import torch
         Example:
+            >>> import torch
             >>> CVaR().inverse_psi(torch.tensor([0.0, 0.25, 0.5, 1.0]), torch.tensor(0.5)).diff()
             tensor([0.5000, 0.5000, 0.0000], dtype=torch.float64)
         """
