@@ -335,3 +335,15 @@ def test_wrong_options_are_refused() -> None:
         InputLimits(max_age_s=0.0)
     with pytest.raises(UserInputError, match="max_lost_share=1"):
         InputLimits(max_lost_share=1.0)
+
+
+def test_the_quantiles_that_are_told_never_cross() -> None:
+    """Those of these drawn networks do: as they are, the lower ones of two critics do not rise."""
+    weights = full_size(seed=3)
+    policy, module = Policy(weights, guard=None), CriticStep(weights, torch.from_numpy(Policy(weights).fractions))
+    told = policy.act(np.full(180, 1.0), AHEAD, STANDING, -1.0).quantiles
+    assert told is not None
+    assert (np.diff(told) >= 0.0).all()
+    head, memory = module.heads[0], torch.zeros(1, 1, 128)
+    raw = head(memory, torch.zeros(1, 1, 2), module.fractions, torch.full((1, 1, 1), -1.0))
+    assert (raw.diff() < 0.0).any()

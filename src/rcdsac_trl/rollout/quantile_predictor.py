@@ -55,6 +55,7 @@ class QuantilePredictor:
                 if "risk" in head.in_keys:
                     entries["risk"] = tensordict["risk"][self.rows].unsqueeze(1)
                 quantiles = dispatch.forward(head.module, *[entries[key] for key in head.in_keys])[:, 0]
+                quantiles = quantiles.sort(dim=-1).values  # as a robot's policy has them
                 lowest = quantiles if lowest is None else torch.minimum(lowest, quantiles)
         assert lowest is not None
         return lowest

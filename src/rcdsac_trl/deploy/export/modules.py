@@ -92,7 +92,7 @@ class CriticStep(nn.Module):
         memories: Tensor,
         remembered: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return quantiles [B, N] (or the mean [B, 1]) and the next memories [critics, B, memory].
+        """Return quantiles in rising order [B, N] (or the mean [B, 1]) and the next memories [critics, B, memory].
 
         Args:
             range_: range observation, [B, 180].
@@ -111,7 +111,8 @@ class CriticStep(nn.Module):
             after.append(state)
             if isinstance(head, QuantileHead):
                 risk = None if head.measure is None else context.unsqueeze(1)
-                values.append(head(memory.unsqueeze(1), action.unsqueeze(1), self.fractions, risk).squeeze(1))
+                quantiles = head(memory.unsqueeze(1), action.unsqueeze(1), self.fractions, risk).squeeze(1)
+                values.append(quantiles.sort(dim=-1).values)
             else:
                 values.append(head(memory, action))
         return torch.stack(values).amin(dim=0), torch.stack(after)

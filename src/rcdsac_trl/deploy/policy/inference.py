@@ -172,6 +172,8 @@ class Critics:
     def values(self, memories: Array, action: Array, embedded: float | None) -> Array:
         """Return the lower of the critics' quantiles each, [N], or of scalar critics' means, [1].
 
+        Quantiles rise: those of each critic are rearranged (Chernozhukov, Fernandez-Val and Galichon 2010).
+
         Args:
             memories: of each critic, [C, memory].
             action: u, [2].
@@ -189,7 +191,8 @@ class Critics:
         weight, bias = self._output
         values = _rectified(x, self._hidden) @ weight
         values += bias
-        return np.minimum.reduce(values)[:, 0]
+        # Networks may cross their quantiles a little; in rising order they are never farther from the true ones.
+        return np.minimum.reduce(np.sort(values, axis=1))[:, 0]
 
 
 def _rectified(x: Array, layer: tuple[Array, Array]) -> Array:
