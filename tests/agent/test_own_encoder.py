@@ -78,6 +78,7 @@ def test_twins_take_the_place_of_the_very_layers_they_know() -> None:
 
 @pytest.mark.parametrize("encoder", OWN)
 def test_it_acts_and_its_critics_predict(encoder: type) -> None:
+    torch.manual_seed(0)  # first weights are drawn from torch's global generator
     network = settings_of(encoder)
     actor = build_actor(measure=PowerLaw(), network=network)
     noise = AgentNoise(range(2))
