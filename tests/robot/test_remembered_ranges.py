@@ -160,3 +160,21 @@ def test_dead_reckoning_follows_arcs() -> None:
     for _ in range(100):
         robot.move(0.0, 1.0, 0.05)
     assert -math.pi <= robot.pose[2] < math.pi
+
+
+def test_places_are_where_things_are() -> None:
+    """Seen from a pose of another frame than the dead reckoning's."""
+    remembered = RememberedRanges(NARROW, memory_s=12.0)
+    turn_away(remembered)
+    # In the frame in which the robot began, the pin is where it was, and the robot looks to the left of it.
+    points, moving = remembered.places((0.0, 0.0, math.pi / 2))
+    assert moving.shape == (0, 3)
+    np.testing.assert_allclose(
+        points.mean(0), [1.5 * math.cos(math.radians(5)), 1.5 * math.sin(math.radians(5))], atol=0.05
+    )
+    # Three metres farther up and turned back by 90 degrees, all turns with it: (x, y) becomes (y, -x).
+    turned, _ = remembered.places((0.0, 3.0, 0.0))
+    np.testing.assert_allclose(turned, np.column_stack([points[:, 1], 3.0 - points[:, 0]]), atol=1e-9)
+    walking = RememberedRanges(NARROW, memory_s=12.0)
+    walk_past(walking, 30)
+    assert walking.places((0.0, 0.0, 0.0))[1] == pytest.approx(np.array([[1.5, 2.0 - 0.07 * 29, 0.25]]), abs=0.1)

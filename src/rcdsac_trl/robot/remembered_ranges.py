@@ -69,6 +69,27 @@ class RememberedRanges:
         self._number = 0
         self._reckoning = DeadReckoning()
         self._tracks = MoverTracks(TrackSettings(), self._sensed)
+        self._moving = np.empty((0, 6))
+
+    def places(self, pose: tuple[float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return where what is remembered lies if the robot is at a pose: for pictures.
+
+        Args:
+            pose: x, y in m and yaw in rad, in the frame that is asked for.
+
+        Returns:
+            Points float64 [n, 2] in m, and what moves, float64 [k, 3]: x, y and radius in m.
+        """
+        own = self._reckoning.pose
+        turn = pose[2] - own[2]
+        cos, sin = math.cos(turn), math.sin(turn)
+
+        def placed(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            placed_points: NDArray[np.float64] = (points - own[:2]) @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
+            return placed_points
+
+        moving = self._moving
+        return placed(self._points[: self._number, :2]), np.column_stack([placed(moving[:, :2]), moving[:, 4]])
 
     def observe(self, ranges_m: NDArray[np.float64], v: float, omega: float, elapsed_s: float) -> NDArray[np.float32]:
         """Move on, take in what is seen now, and return what is remembered.
@@ -96,6 +117,7 @@ class RememberedRanges:
         points, cells, rows = self._points, self._cells, self._rows
         number = _forget(points, cells, rows, self._number, pose, time_s - self._memory_s, seen_m, self._sensed, moving)
         self._number = _add(points, cells, rows, number, pose, time_s, seen_m, self._sensed, moving)
+        self._moving = moving
         _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose)
         _tell_movers(told, moving, pose)
         return told

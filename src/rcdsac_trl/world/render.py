@@ -7,7 +7,7 @@ does not move is drawn once a map.
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -31,6 +31,7 @@ MOVER: Color = (214, 92, 92)
 MOVER_EDGE: Color = (160, 52, 56)
 SEEN: Color = (64, 132, 214, 52)
 HIT: Color = (28, 98, 190)
+REMEMBERED: Color = (28, 98, 190, 150)
 TRAIL: Color = (36, 122, 92)
 PATH: Color = (150, 96, 190)
 GOAL: Color = (126, 58, 176)
@@ -53,6 +54,8 @@ class Scene:
         movers: x, y and radius of each mover, [m, 3].
         trail: positions since the episode began, oldest first.
         in_contact: whether the robot is in contact.
+        remembered: points that the agent is told of because it saw them, [n, 2].
+        expected: where it expects what moves, x, y and radius, [k, 3].
     """
 
     map: Map
@@ -63,6 +66,8 @@ class Scene:
     movers: np.ndarray
     trail: Sequence[tuple[float, float]]
     in_contact: bool
+    remembered: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
+    expected: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
 
 class Renderer:
@@ -109,6 +114,10 @@ class Renderer:
         _draw_path(canvas, scene)
         for x, y, radius in scene.movers:
             canvas.disc(x, y, radius, MOVER, MOVER_EDGE, 0.04)
+        for x, y in scene.remembered:
+            canvas.disc(x, y, 0.05, REMEMBERED)
+        for x, y, radius in scene.expected:
+            canvas.disc(x, y, radius, None, REMEMBERED, 0.05)
         _draw_robot(canvas, scene)
         if caption:
             self._write(canvas.image, caption)

@@ -181,7 +181,15 @@ class NavigationAgent:
             movers=np.column_stack([simulation.mover_positions, simulation.mover_radii]),
             trail=tuple(self._trail),
             in_contact=self.in_contact,
+            **self._remembered_places(),
         )
+
+    def _remembered_places(self) -> dict[str, NDArray[np.float64]]:
+        """Return what a picture shows of what is remembered, by its names; nothing without a memory."""
+        if self._memory is None:
+            return {}
+        remembered, expected = self._memory.places(self.pose)
+        return {"remembered": remembered, "expected": expected}
 
     def close(self) -> None:
         """Disconnect from the physics engine."""
