@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.seeding import torch_stream
 from rcdsac_trl.training import setup
@@ -25,11 +26,12 @@ def make_learner(algo: str, overrides: list[str]) -> Learner:
     settings = training_settings(compose("train", [f"+algo={algo}", *overrides, "replay.capacity_steps=20000"]))
     learner = setup.make_learner(settings, "cpu")
     mask = torch.from_numpy(sensor_mask(settings.sensor.name))
-    learner.replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask))
+    vectors = vector_observations(settings.sensor.memory_s)
+    learner.replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask, vectors))
     return learner
 
 
-def random_episodes(number: int, steps: int, mask: torch.Tensor) -> TensorDict:
+def random_episodes(number: int, steps: int, mask: torch.Tensor, vectors: dict[str, int]) -> TensorDict:
     """Return episodes ``[number, steps]`` of noise, as a collector would."""
     generator = torch_stream(0, "benchmark")
 
@@ -39,7 +41,7 @@ def random_episodes(number: int, steps: int, mask: torch.Tensor) -> TensorDict:
     def observations() -> dict[str, torch.Tensor]:
         # A third of the bins is out of range, which reads 0.
         ranges = (0.5 + 2.4 * uniform(180)) * (uniform(180) > 1 / 3) * mask
-        return {"range": ranges, "waypoint": uniform(6), "velocity": uniform(4)}
+        return {"range": ranges} | {key: uniform(size) for key, size in vectors.items()}
 
     outcome = observations() | {"reward_components": -uniform(5)}
     content = observations() | {"action": 2.0 * uniform(2) - 1.0, "risk": -uniform(1), "next": outcome}

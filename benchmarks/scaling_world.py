@@ -73,7 +73,7 @@ def replay_bytes(steps: int) -> int:
 
     from rcdsac_trl.robot.range_sensor import sensor_mask
     from rcdsac_trl.storage.replay import SequenceReplay
-    from rcdsac_trl.world.task.spaces import SPACES
+    from rcdsac_trl.world.task.spaces import Buffers
 
     episode_steps = 1000
     replay = SequenceReplay(
@@ -86,7 +86,8 @@ def replay_bytes(steps: int) -> int:
         seed=0,
         device="cpu",
     )
-    seen = {key: torch.zeros(1, episode_steps, space.size) for key, space in SPACES.items()}
+    written = Buffers.zeros(1, memory_s=0.0)
+    seen = {key: torch.zeros(1, episode_steps, array.shape[1]) for key, array in written.items()}
     flags = {key: torch.zeros(1, episode_steps, 1, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
     episode = TensorDict(
         {**seen, "risk": torch.zeros(1, episode_steps, 1), "action": torch.zeros(1, episode_steps, 2)},

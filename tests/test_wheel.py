@@ -52,6 +52,8 @@ def lend_compiled(installed: Path) -> None:
         target.parent.mkdir(exist_ok=True)
         shutil.copyfile(cache, target)
     for module in {cache.parents[1] / f"{cache.name.split('.')[0]}.py" for cache in caches}:
+        if not module.exists():  # it has been moved since it was compiled
+            continue
         times = module.stat()
         os.utime(installed / module.relative_to(source), ns=(times.st_atime_ns, times.st_mtime_ns))
 

@@ -464,7 +464,12 @@ def test_sigterm_ends_an_evaluation_and_its_processes_and_keeps_the_maps_that_ha
     assert re.fullmatch(r"rcdsac_trl: \d+ of 100000 maps are in there/unfinished", told[-2])
     assert told[-1] == "rcdsac_trl: ended by SIGTERM"
     assert "leaked" not in err
-    assert sorted(path.name for path in kept.parent.iterdir()) == ["episodes.csv", "evaluation.json", "summary.csv"]
+    assert sorted(path.name for path in kept.parent.iterdir()) == [
+        "collisions.csv",
+        "episodes.csv",
+        "evaluation.json",
+        "summary.csv",
+    ]
 
 
 @pytest.mark.slow

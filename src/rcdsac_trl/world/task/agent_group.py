@@ -39,12 +39,12 @@ class AgentGroup(OfOneProcess):
         map_settings: how maps are generated.
         task: rules of the task.
         sensor: one of :data:`rcdsac_trl.robot.range_sensor.SENSORS`.
-        memory_s: for how long an agent is told of points that it saw, s; 0: not at all.
         split: which of the disjoint map sets.
         seed: root seed, at least 0.
         agent_ids: the agents' global numbers, at least 0; agents with equal numbers meet the same episodes.
         first_episode: number of each agent's first episode, at least 0.
         gui: show PyBullet's window for the first agent.
+        memory_s: for how long an agent is told of points that it saw, s; 0: not at all.
 
     Attributes:
         buffers: what the agents wrote last, overwritten by every reset and step.
@@ -60,12 +60,12 @@ class AgentGroup(OfOneProcess):
         task: TaskSettings | None,
         *,
         sensor: str,
-        memory_s: float,
         split: Split,
         seed: int,
         agent_ids: Sequence[int],
         first_episode: int,
         gui: bool,
+        memory_s: float = 0.0,
     ) -> None:
         if split not in SPLITS:
             raise UserInputError(f"split={split!r} does not exist; choose one of {', '.join(SPLITS)}")
