@@ -18,6 +18,8 @@ import tiny
 from rcdsac_trl import evaluate, train
 from rcdsac_trl.cli import Command, precheck
 from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.config.experiment_settings import SearchSettings
+from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.measured_run import MeasuredRun
 from rcdsac_trl.report.card import driving_section
@@ -180,6 +182,8 @@ def refusal(
         # what Hydra itself refuses
         ([POW, "learner.batch_size=["], "learner.batch_size=[ cannot be read: write it as <key>=<value>"),
         ([POW, "+="], "+= names no key: write it as <key>=<value>"),
+        (["+algo="], "algo= does not exist: choose one of dsac_cvar, "),
+        ([POW, "preset="], "preset= does not exist: choose one of laptop, "),
         ([POW, "hydra/launcher=far"], "hydra/launcher=far does not exist: leave it out"),
         ([POW, "fast"], "fast cannot be read: write it as <key>=<value>"),
         ([POW, "seed=${foo}"], "Interpolation key 'foo' not found"),
@@ -217,6 +221,28 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
     told = refusal(train.main, [POW, f"hydra.run.dir={tiny_run}"])
     assert told == f"{tiny_run} already holds a run: choose another hydra.run.dir"
     assert sorted((path, path.stat().st_mtime_ns) for path in tiny_run.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("verb", "given", "key"),
+    [
+        *((verb, "run=", "run") for verb in ("evaluate", "calibrate", "course", "export", "plot_training")),
+        *((verb, "out=", "out") for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps")),
+        ("plot_training", "out='  '", "out"),
+        ("course", "run=[sac-narrow,'']", "run"),
+        ("report", "runs=['']", "runs"),
+        ("publish", "runs=['']", "runs"),
+    ],
+)
+def test_an_empty_name_is_not_the_folder_one_is_in(verb: str, given: str, key: str) -> None:
+    with pytest.raises(UserInputError, match=f"^{key} names no folder: give it one, or leave it out$"):
+        compose(verb, [given])
+
+
+@pytest.mark.parametrize("name", ["", "' '", ".", "..", "../mine", "mine/"])
+def test_a_search_is_named_by_a_word(name: str) -> None:
+    with pytest.raises(UserInputError, match=r"^search\.name=.* names no folder in multirun/"):
+        read(SearchSettings, dict(compose("search", [f"search.name={name}"]).search), "search")
 
 
 # ------------------------------------------------------------------------------------------------ evaluate
@@ -464,12 +490,8 @@ def test_sigterm_ends_an_evaluation_and_its_processes_and_keeps_the_maps_that_ha
     assert re.fullmatch(r"rcdsac_trl: \d+ of 100000 maps are in there/unfinished", told[-2])
     assert told[-1] == "rcdsac_trl: ended by SIGTERM"
     assert "leaked" not in err
-    assert sorted(path.name for path in kept.parent.iterdir()) == [
-        "collisions.csv",
-        "episodes.csv",
-        "evaluation.json",
-        "summary.csv",
-    ]
+    names = ["collisions.csv", "episodes.csv", "evaluation.json", "summary.csv"]
+    assert sorted(path.name for path in kept.parent.iterdir()) == names
 
 
 @pytest.mark.slow

@@ -2,8 +2,10 @@
 
 import copy
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -159,6 +161,51 @@ def test_a_memory_is_not_carried_over_a_gap() -> None:
     late = policy.act(OPEN, AHEAD, STANDING, stamps=at(11.0))
     assert late.forgot
     assert late.wanted == fresh.wanted
+
+
+def test_a_refusal_before_a_gap_does_not_carry_the_memory_over_it() -> None:
+    policy = Policy(agent())
+    policy.act(OPEN, AHEAD, STANDING, stamps=at(10.0))
+    assert policy.act(None, AHEAD, STANDING, stamps=at(10.14)).stopped
+    assert policy.act(OPEN, AHEAD, STANDING, stamps=at(1000.0)).forgot
+
+
+def test_a_refusal_makes_no_new_scan_of_one_that_was_seen() -> None:
+    policy = Policy(agent())
+    first = policy.act(OPEN, AHEAD, STANDING, stamps=at(10.0))
+    assert policy.act(OPEN, AHEAD, [math.nan, 0.0], stamps=replace(at(10.05), scan_s=9.95)).stopped
+    again = policy.act(OPEN, AHEAD, STANDING, stamps=replace(at(10.1), scan_s=9.95))
+    assert (again.reason, again.fresh, again.wanted) == (None, False, first.wanted)
+
+
+def test_stamps_that_the_caller_fills_anew_are_not_those_of_before() -> None:
+    policy = Policy(agent())
+    stamps: Any = SimpleNamespace(**asdict(at(10.0)))
+    for _ in range(3):
+        assert policy.act(OPEN, AHEAD, STANDING, stamps=stamps).fresh
+        for name, value in vars(stamps).items():
+            setattr(stamps, name, value + PERIOD_S)
+
+
+def test_sectors_that_say_nothing_clear_nothing_that_is_remembered() -> None:
+    weights = full_size(memory_s=9.0)
+    near = np.where(np.arange(180) < 4, 1.0, np.inf)
+    lost = Sectors(np.full(180, np.inf), np.arange(180) >= 4)
+    remembers, sees_through = Policy(weights), Policy(weights)
+    for policy in (remembers, sees_through):
+        policy.act(near, AHEAD, STANDING)
+    assert remembers.act(lost, AHEAD, STANDING).wanted != sees_through.act(OPEN, AHEAD, STANDING).wanted
+
+
+def test_time_passes_for_what_is_remembered_while_calls_without_stamps_are_refused() -> None:
+    """Of one that drives at 0.6 m/s and is refused twice, 3 periods of the middle 0.14 s later."""
+    policy = Policy(agent(memory_s=9.0))
+    policy.act(OPEN, AHEAD, [0.6, 0.0])
+    for _ in range(2):
+        policy.act(None, AHEAD, [0.6, 0.0])
+    with patch.object(RememberedRanges, "observe", return_value=np.zeros(46, np.float32)) as observe:
+        policy.act(OPEN, AHEAD, [0.6, 0.0])
+    assert observe.call_args.args[3] == pytest.approx(3 * 0.14)
 
 
 # ------------------------------------------------------------------------------------------------ bad input
@@ -329,8 +376,10 @@ def test_trouble_on_the_way_stops_or_holds_and_good_input_drives_on(events: list
 
 
 def test_wrong_options_are_refused() -> None:
-    with pytest.raises(UserInputError, match="num_quantiles=0"):
-        Policy(agent(), num_quantiles=0)
+    for odd in (0, -3, 2.5, True, math.nan, "8", None):
+        with pytest.raises(UserInputError, match=f"num_quantiles={odd}"):
+            Policy(agent(), num_quantiles=odd)  # type: ignore[arg-type]
+    assert len(Policy(agent(), num_quantiles=np.int64(3)).fractions) == 3  # type: ignore[arg-type]
     with pytest.raises(UserInputError, match="max_age_s=0"):
         InputLimits(max_age_s=0.0)
     with pytest.raises(UserInputError, match="max_lost_share=1"):

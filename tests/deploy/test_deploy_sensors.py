@@ -1,6 +1,7 @@
 """Scans and clouds to sectors: equal to the simulator's own sensor on the same scene, and right about what is lost."""
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy import CameraPose, CloudFilter, Mount, Scan, Sectors, cloud_sectors, scan_sectors
+from rcdsac_trl.deploy import CameraPose, CloudFilter, Guard, Mount, Scan, Sectors, cloud_sectors, scan_sectors
 from rcdsac_trl.deploy.sensors.sectors import bins_of, nearest_by_sector
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
@@ -298,6 +299,33 @@ def test_what_is_no_cloud_is_refused(points: Any) -> None:
 def test_what_is_no_pose_is_refused(bad: dict[str, Any]) -> None:
     with pytest.raises(UserInputError, match="camera"):
         CameraPose(**({"position_m": (0.0, 0.0, 0.3)} | bad))
+
+
+@pytest.mark.parametrize("bad", [{"position_m": (0.0, 0.3), "quaternion": (0.0, 0.0, 0.0, 0.0, 1.0)}])
+def test_a_pose_has_three_metres_and_four_numbers_of_a_quaternion(bad: dict[str, Any]) -> None:
+    with pytest.raises(UserInputError, match="not three metres, a quaternion and an angle"):
+        CameraPose(**bad)
+
+
+@pytest.mark.parametrize("bad", [{"support": 1.5}, {"support": math.nan}, {"min_points": math.nan}, {"support": True}])
+def test_points_are_counted_in_whole_numbers(bad: dict[str, Any]) -> None:
+    with pytest.raises(UserInputError, match=f"{next(iter(bad))}=.* counts points: give a whole number"):
+        CloudFilter(**bad)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (Mount, "upside_down"),
+        (partial(CameraPose, (0.0, 0.0, 0.3)), "optical"),
+        (Guard, "blind_reverse"),
+    ],
+)
+def test_a_switch_that_is_a_text_is_refused(make: Any, name: str) -> None:
+    assert make(**{name: np.bool_(False)})
+    for odd in ("no", "false", 0, None):
+        with pytest.raises(UserInputError, match=f"{name}={odd!r} of a .* is neither True nor False"):
+            make(**{name: odd})
 
 
 coordinates = st.one_of(st.floats(-19.0, 19.0, width=32), st.sampled_from([math.nan, math.inf, -math.inf]))

@@ -17,6 +17,7 @@ from rcdsac_trl.deploy import (
     Guard,
     InputLimits,
     Mount,
+    PathFollower,
     Policy,
     Scan,
     Sectors,
@@ -195,6 +196,8 @@ def test_clouds_are_in_metres_and_their_zeros_are_nothing() -> None:
         (lambda: Guard(margin_m=50.0), "margin_m=50 of the guard is above 2"),
         (lambda: Guard(reaction_s=250.0), "reaction_s=250 of the guard is above 5"),
         (lambda: ClearanceBeta(-2.0, 0.0, near_m=400.0, far_m=1200.0), "near_m=400 is beyond the 3 m that agents see"),
+        (lambda: PathFollower([(0.0, 0.0)], agent().config, tolerance_m=50.0), r"tolerance_m=50.0 is outside \[0, 1\]"),
+        (lambda: PathFollower([(0.0, 0.0)], agent().config, tolerance_m=math.nan), "tolerance_m=nan is outside"),
     ],
 )
 def test_limits_and_mounts_in_other_units_are_refused(make: Any, told: str) -> None:

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -66,10 +67,18 @@ def test_controllers_refuse_what_makes_no_sense() -> None:
     for make in (ClearanceBeta, TailVarianceBeta):
         with pytest.raises(UserInputError, match="low=0 is above high=-2"):
             make(0.0, -2.0)
+        with pytest.raises(UserInputError, match="low=-inf and high=0 are not both finite"):
+            make(-math.inf, 0.0)
     with pytest.raises(UserInputError, match="near_m below far_m"):
         ClearanceBeta(-2.0, 0.0, near_m=2.0, far_m=1.0)
     with pytest.raises(UserInputError, match="window_steps=1 is below 2"):
         TailVarianceBeta(-2.0, 0.0, window_steps=1)
+
+
+@pytest.mark.parametrize("quantiles", [[1.0], [], [1.0, math.nan], [-math.inf, 1.0], 3.0, [[1.0, 2.0]]])
+def test_what_has_no_lower_tail_makes_nobody_bold(quantiles: Any) -> None:
+    with pytest.raises(UserInputError, match="have no lower half that is finite"):
+        TailVarianceBeta(-2.0, 0.0)(NOTHING, np.array(quantiles))
 
 
 def test_distances_come_back_from_observations() -> None:

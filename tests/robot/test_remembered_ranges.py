@@ -91,6 +91,27 @@ def test_what_is_seen_through_is_cleared(seen_m: float, remains: bool) -> None:
     assert told[0] == pytest.approx(0.0 if nearest_m == np.inf else nearness(nearest_m), abs=1e-3)
 
 
+def test_a_sector_that_was_not_measured_is_not_seen_through() -> None:
+    remembered = RememberedRanges(NARROW, memory_s=12.0)
+    remembered.observe(at_bin(2, 1.5), 0.0, 0.0, 0.0)
+    measured = np.arange(180) != 2
+    assert remembered.observe(NOTHING, 0.0, 0.0, PERIOD_S, measured)[0] == pytest.approx(nearness(1.5), abs=1e-3)
+    assert not remembered.observe(NOTHING, 0.0, 0.0, PERIOD_S, measured | True)[0]
+
+
+def test_the_gap_beside_a_sector_that_was_not_measured_is_no_edge_of_a_thing() -> None:
+    """A thing that is not seen whole has no middle: its track waits."""
+    tracked, waits = (RememberedRanges(NARROW, memory_s=12.0) for _ in range(2))
+    disc = ranges((0.0, 0.0, 0.0), (1.5, 0.0, 0.25))
+    hidden = disc.copy()
+    hidden[:5] = np.inf
+    for remembered, measured in ((tracked, None), (waits, np.arange(180) >= 5)):
+        remembered._tracks.observe(disc, np.zeros(3), 0.0)
+        remembered._tracks.observe(hidden, np.zeros(3), PERIOD_S, None if measured is None else NARROW & measured)
+    assert tracked._tracks._tracks[:, 5].max() == 2.0
+    assert waits._tracks._tracks[:, 5].max() == 1.0
+
+
 def test_points_are_forgotten_after_their_time() -> None:
     remembered = RememberedRanges(NARROW, memory_s=9.0)
     turn_away(remembered)  # 7 s, of which it is seen for half

@@ -1,8 +1,9 @@
-"""The allocator: set up where that is possible, named truly, never in the way."""
+"""The allocator: set up where that is possible, named truly, never in the way. Output: never in the way either."""
 
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -78,3 +79,40 @@ def test_it_works_from_a_processs_first_moment() -> None:
     plain = {name: value for name, value in os.environ.items() if name not in (*KEPT, "LD_PRELOAD")}
     done = subprocess.run([sys.executable, "-c", code], env=plain, capture_output=True, text=True, check=True)
     assert done.stdout == "glibc that keeps its pages\n"
+
+
+TALKS = """
+import os, sys
+from pathlib import Path
+from rcdsac_trl.system.runtime import speak_anywhere
+speak_anywhere()
+for _ in range(1000):
+    print("β" * 200)
+    print("γ" * 200, file=sys.stderr)
+sys.stderr.flush()
+os.write(1, b"C code talks as well")
+import rcdsac_trl.world.sim.bullet
+Path(sys.argv[1]).write_text(str([os.get_inheritable(fd) for fd in (0, 1, 2)]))
+"""
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_work_goes_on_where_the_reader_of_its_output_has_left(stream: str, tmp_path: Path) -> None:
+    done = tmp_path / "done"
+    reads, writes = os.pipe()
+    os.close(reads)
+    other = "stderr" if stream == "stdout" else "stdout"
+    command = [sys.executable, "-c", TALKS, str(done)]
+    ended = subprocess.run(command, **{stream: writes, other: subprocess.PIPE}, timeout=300, check=False)
+    os.close(writes)
+    assert ended.returncode == 0
+    assert done.read_text() == "[True, True, True]"
+    assert b"BrokenPipe" not in (ended.stderr or b"")
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
+def test_work_goes_on_where_there_is_nowhere_to_talk_to(closed: str, tmp_path: Path) -> None:
+    done = tmp_path / "done"
+    command = ["sh", "-c", f'exec "$0" -c "$1" "$2" {closed}', sys.executable, TALKS, str(done)]
+    ended = subprocess.run(command, capture_output=True, timeout=300, check=False)
+    assert (ended.returncode, done.read_text()) == (0, "[True, True, True]")

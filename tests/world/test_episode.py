@@ -86,6 +86,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch):
             seed=0,
             agent_ids=(0,),
             first_episode=0,
+            memory_s=0.0,
             gui=False,
         )
         group.reset((0,))
@@ -263,6 +264,10 @@ def test_noise_is_seen_but_not_paid_and_repeats_with_the_seed(scripted) -> None:
         np.array([0.0, 0.0]),
         np.zeros((2, 2)),
         np.zeros((1, 3)),
+        np.array([["a", "b"]]),
+        np.array([[0.0, 1.0j]]),
+        np.array([[None, 0.0]]),
+        np.array([[True, False]]),
     ],
 )
 def test_actions_that_are_none_are_refused(scripted, action: np.ndarray) -> None:
@@ -280,16 +285,20 @@ def test_actions_that_are_none_are_refused(scripted, action: np.ndarray) -> None
         ("sensor", "wide"),
         ("agent_ids", ()),
         ("agent_ids", (0, -1)),
+        ("agent_ids", (1.5,)),
+        ("agent_ids", ("0",)),
     ],
 )
 def test_wrong_settings_are_refused_by_name(name: str, value: object) -> None:
     good: dict[str, object] = {"sensor": "full", "split": "train", "seed": 0, "agent_ids": (0,)}
     with pytest.raises(UserInputError, match=name):
-        AgentGroup(None, None, **({"first_episode": 0, "gui": False} | good | {name: value}))
+        AgentGroup(None, None, **({"first_episode": 0, "memory_s": 0.0, "gui": False} | good | {name: value}))
 
 
 def test_an_agent_that_was_never_reset_says_so() -> None:
-    group = AgentGroup(None, None, sensor="full", split="train", seed=0, agent_ids=(0,), first_episode=0, gui=False)
+    group = AgentGroup(
+        None, None, sensor="full", split="train", seed=0, agent_ids=(0,), first_episode=0, memory_s=0.0, gui=False
+    )
     with pytest.raises(UserInputError, match="reset"):
         group.scene(0)
     group.close()

@@ -24,6 +24,17 @@ from rcdsac_trl.world.task.rules import TaskSettings
 SMALL = MapSettings(size_m=12.0, layouts=("clutter",), clutter_per_m2=0.08, num_movers=1)
 
 
+def test_what_is_no_setting_and_no_option_is_refused() -> None:
+    for odd in ("9", True, None):
+        with pytest.raises(UserInputError, match=r"sensor\.memory_s=.* is no number: give seconds"):
+            NavigationGymEnv(memory_s=odd)
+    env = NavigationGymEnv(map_settings=SMALL, memory_s=np.float32(9.0))
+    for options in ("x", 5, ["episode"]):
+        with pytest.raises(UserInputError, match="are no dictionary"):
+            env.reset(options=options)  # type: ignore[arg-type]
+    env.close()
+
+
 @pytest.mark.parametrize("sensor", ["narrow", "sparse", "full"])
 def test_gymnasiums_own_check_passes(sensor: str) -> None:
     env = gymnasium.make(ENV_ID, map_settings=SMALL, sensor=sensor, render_mode="rgb_array")

@@ -8,6 +8,9 @@ import numpy as np
 import pybullet
 import pytest
 
+from rcdsac_trl.config.compose import compose
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import Box, Cylinder, Map, MapSettings, Mover, generate_map
@@ -30,6 +33,21 @@ def room(size_m=8.0, cylinders=(), movers=()):
         Box(size_m + 0.1, middle, half, 0.1, math.pi / 2.0, mapped=True),
     )
     return Map("clutter", size_m, walls, tuple(cylinders), tuple(movers))
+
+
+@pytest.mark.parametrize(("display", "told"), [(None, "DISPLAY is not set"), (":12345", "DISPLAY=:12345 cannot be")])
+def test_a_window_without_a_display_is_refused_and_ends_no_process(
+    monkeypatch: pytest.MonkeyPatch, display: str | None, told: str
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    if display is not None:
+        monkeypatch.setenv("DISPLAY", display)
+    # PyBullet, asked for a window, would end the process that runs this test.
+    monkeypatch.setattr(world_simulation, "Client", None)
+    with pytest.raises(UserInputError, match=rf"gui=true needs a display, and {told}"):
+        Simulation(gui=True)
+    with pytest.raises(UserInputError, match=rf"gui=true needs a display, and {told}"):
+        make_evaluation(compose("evaluate", ["baseline=pursuit", "gui=true"]))
 
 
 @pytest.fixture

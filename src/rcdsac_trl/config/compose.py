@@ -12,7 +12,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcdsac_trl.config.command_line import key_of, several, unreadable
@@ -21,6 +21,8 @@ from rcdsac_trl.config.typed import unknown_key
 from rcdsac_trl.errors import UserInputError, first_line
 
 _ABSENT = object()
+# Keys of verbs that name a folder, or a file of one, or several.
+_FOLDERS = ("run", "runs", "out")
 
 
 def output_folder(config_name: str, overrides: list[str]) -> Path:
@@ -73,7 +75,15 @@ def compose(config_name: str, overrides: list[str]) -> DictConfig:
         OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
         raise UserInputError(_not_resolved(error)) from error
+    for key in _FOLDERS:
+        _refuse_no_folder(key, cfg.get(key))
     return cfg
+
+
+def _refuse_no_folder(key: str, named: Any) -> None:
+    """Refuse an empty name, such as that of a variable that a script left empty: it would mean the folder one is in."""
+    if any(not name.strip() for name in (named if isinstance(named, ListConfig) else [named]) if isinstance(name, str)):
+        raise UserInputError(f"{key} names no folder: give it one, or leave it out")
 
 
 def _not_resolved(error: OmegaConfBaseException) -> str:
@@ -133,7 +143,7 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     text = str(error)
     if isinstance(error, OverrideParseException):
         return unreadable(error.override or "", overrides)
-    if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']+)'", text):
+    if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']*)'", text):
         group, name = match.groups()
         known = choices(group)
         return f"{group}={name} does not exist: " + (f"choose one of {', '.join(known)}" if known else "leave it out")

@@ -76,8 +76,6 @@ class CourseSettings:
 
     def __post_init__(self) -> None:
         """Refuse what is below its limit, and what is there twice."""
-        if self.out == "":
-            raise UserInputError("out names no folder: give it one, or leave it out")
         check_least("repetitions", self.repetitions, 1)
         check_least("seed", self.seed, 0)
         if not PERIOD_S <= self.time_limit_s <= 3600.0:

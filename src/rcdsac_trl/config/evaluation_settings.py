@@ -109,8 +109,6 @@ class EvaluationSettings:
             raise UserInputError(
                 "name what to evaluate: either run=<folder or shipped agent> or baseline=<name>, such as mppi"
             )
-        if self.out == "":
-            raise UserInputError("out names no folder: give it one, or leave it out")
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
         asked = self.beta_controller or ()

@@ -32,7 +32,9 @@ class SearchSettings:
     storage: str | None
 
     def __post_init__(self) -> None:
-        """Refuse what is below its limit."""
+        """Refuse what is below its limit, and a name that no folder beside the others can have."""
+        if not self.name.strip(". ") or "/" in self.name:
+            raise UserInputError(f"search.name={self.name} names no folder in multirun/: give a word, or leave it out")
         for key in ("trials", "averaged_validations"):
             check_least(f"search.{key}", getattr(self, key), 1)
         for key in ("startup_trials", "warmup_iterations", "seed"):

@@ -29,6 +29,7 @@ from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
+from rcdsac_trl.world.sim.bullet import check_display
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
@@ -45,6 +46,8 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     settings = read_config(cfg, EvaluationSettings)
     if settings.record:
         check_extra()
+    if settings.gui:
+        check_display()
     named = None if settings.run is None else named_agent(settings.run, settings.checkpoint)
     trained = default_training() if named is None else named.settings
     spec = _spec(settings, trained)

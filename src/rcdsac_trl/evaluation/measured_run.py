@@ -81,9 +81,9 @@ class MeasuredRun:
         """
         rows = self._measured()
         found = self._findings(rows)
+        self.results.write(found.tables)  # first: what follows may find the disk full that the output goes to
         if found.text is not None:
             print(found.text)
-        self.results.write(found.tables)
         if describe is not None:
             with Work("tables and figures of them", 1, "report"):
                 described = describe(self.results.path)

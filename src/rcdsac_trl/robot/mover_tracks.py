@@ -73,18 +73,26 @@ class MoverTracks:
         self.sensed = np.asarray(sensed, np.bool_)
         self._tracks = np.zeros((_MOST_TRACKS, 7))
 
-    def observe(self, ranges_m: NDArray[np.float64], pose: NDArray[np.float64], elapsed_s: float) -> None:
+    def observe(
+        self,
+        ranges_m: NDArray[np.float64],
+        pose: NDArray[np.float64],
+        elapsed_s: float,
+        sensed: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Move the tracks on, and correct those that are seen.
 
         Args:
             ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m.
             pose: the robot's x and y in m and yaw in rad, odometry frame.
             elapsed_s: since the last observation, s.
+            sensed: those of the sensor's sectors that say something now, bool [180]; None: all of them.
         """
+        sensed = self.sensed if sensed is None else sensed
         settings, tracks = self.settings, self._tracks
         _move_on(tracks, elapsed_s, settings.coast_s)
         things = np.empty((NUM_BINS, 2))
-        number = _find(things, ranges_m, pose, self.sensed, settings.step_m, settings.widest_m, settings.radius_m)
+        number = _find(things, ranges_m, pose, sensed, settings.step_m, settings.widest_m, settings.radius_m)
         _correct(tracks, things[:number], settings.gate_m, settings.position_gain, settings.velocity_gain)
 
     @property

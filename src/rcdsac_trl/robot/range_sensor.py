@@ -36,8 +36,10 @@ def check_memory(memory_s: float) -> None:
     """Refuse a time that nothing can be remembered for.
 
     Raises:
-        UserInputError: if it is negative, not finite, or above :data:`LONGEST_MEMORY_S`.
+        UserInputError: if it is no number, negative, not finite, or above :data:`LONGEST_MEMORY_S`.
     """
+    if isinstance(memory_s, bool) or not isinstance(memory_s, int | float | np.integer | np.floating):
+        raise UserInputError(f"sensor.memory_s={memory_s!r} is no number: give seconds, 0 for no memory")
     if not 0.0 <= memory_s <= LONGEST_MEMORY_S:
         raise UserInputError(
             f"sensor.memory_s={memory_s:g} is outside [0, {LONGEST_MEMORY_S:g}]: give seconds, 0 for no memory"

@@ -91,7 +91,14 @@ class RememberedRanges:
         moving = self._moving
         return placed(self._points[: self._number, :2]), np.column_stack([placed(moving[:, :2]), moving[:, 4]])
 
-    def observe(self, ranges_m: NDArray[np.float64], v: float, omega: float, elapsed_s: float) -> NDArray[np.float32]:
+    def observe(
+        self,
+        ranges_m: NDArray[np.float64],
+        v: float,
+        omega: float,
+        elapsed_s: float,
+        measured: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.float32]:
         """Move on, take in what is seen now, and return what is remembered.
 
         Args:
@@ -100,6 +107,8 @@ class RememberedRanges:
             v: linear velocity measured now, m/s.
             omega: angular velocity measured now, rad/s.
             elapsed_s: since the last observation, 0 at the first, s.
+            measured: which sectors say something now, bool [180]; None: all that the sensor has. The others are not
+                read either, so what is remembered there stays.
 
         Returns:
             float32 [46]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
@@ -109,14 +118,15 @@ class RememberedRanges:
             bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
         """
         self._reckoning.move(v, omega, elapsed_s)
-        seen_m = np.where(self._sensed, ranges_m, np.inf)
+        sensed = self._sensed if measured is None else self._sensed & measured
+        seen_m = np.where(sensed, ranges_m, np.inf)
         pose, time_s = self._reckoning.pose, self._reckoning.time_s
-        self._tracks.observe(seen_m, pose, elapsed_s)
+        self._tracks.observe(seen_m, pose, elapsed_s, sensed)
         moving = self._tracks.moving
         told = np.zeros(REMEMBERED_SIZE, np.float32)
         points, cells, rows = self._points, self._cells, self._rows
-        number = _forget(points, cells, rows, self._number, pose, time_s - self._memory_s, seen_m, self._sensed, moving)
-        self._number = _add(points, cells, rows, number, pose, time_s, seen_m, self._sensed, moving)
+        number = _forget(points, cells, rows, self._number, pose, time_s - self._memory_s, seen_m, sensed, moving)
+        self._number = _add(points, cells, rows, number, pose, time_s, seen_m, sensed, moving)
         self._moving = moving
         _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose)
         _tell_movers(told, moving, pose)

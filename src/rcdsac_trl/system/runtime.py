@@ -66,10 +66,49 @@ def speak_anywhere() -> None:
     """Let what a program prints be read wherever it goes, and when it is printed.
 
     A terminal may have no letter for it, such as a β where the locale is C; a pipe or a file would get it at the end.
+    Where nobody reads, since the stream was closed from the start or its reader leaves (``| head -1``), what is printed
+    goes nowhere and the work goes on.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            _to_nowhere(number)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))  # noqa: SIM115
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if type(stream) is io.TextIOWrapper:
+            lasting = _Lasting(stream.detach(), encoding=stream.encoding)
+            setattr(sys, name, lasting)
+            setattr(sys, f"__{name}__", lasting)
+        if isinstance(stream := getattr(sys, name), io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace", line_buffering=True)
+
+
+class _Lasting(io.TextIOWrapper):
+    """A stream that outlasts its reader."""
+
+    def write(self, text: str) -> int:
+        try:
+            return super().write(text)
+        except BrokenPipeError:
+            _to_nowhere(self.fileno())
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except BrokenPipeError:
+            _to_nowhere(self.fileno())
+            super().flush()
+
+
+def _to_nowhere(descriptor: int) -> None:
+    """Let a file descriptor, open or not, lead to where all is swallowed and nothing can be read."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    if nowhere == descriptor:
+        os.set_inheritable(descriptor, True)
+        return
+    os.dup2(nowhere, descriptor)
+    os.close(nowhere)
 
 
 def let_workers_rest() -> None:

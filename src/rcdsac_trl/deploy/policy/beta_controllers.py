@@ -5,6 +5,7 @@ now and the quantiles of the command before, and returns the beta to drive with.
 ``low`` is the most careful one that a controller uses, and ``high`` the boldest.
 """
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -60,7 +61,8 @@ class ClearanceBeta:
         sensor: which sectors count, those that the agent sees.
 
     Raises:
-        UserInputError: unless low is at most high, and near_m below far_m, above 0 and within 3 m.
+        UserInputError: unless low and high are finite, low is at most high, and near_m below far_m, above 0 and within
+            3 m.
 
     Example:
         >>> controller = ClearanceBeta(-2.0, 0.0, near_m=0.4, far_m=1.2)
@@ -97,10 +99,18 @@ def lower_tail_variance(quantiles: Array) -> float:
     Args:
         quantiles: at equally spaced fractions, [N], at least 2.
 
+    Raises:
+        UserInputError: if they are fewer, or not finite: there is no tail to speak of.
+
     Example:
         >>> lower_tail_variance(np.array([0.0, 4.0, 6.0, 100.0]))  # median 5
         13.0
     """
+    if np.ndim(quantiles) != 1 or len(quantiles) < 2 or not np.isfinite(quantiles).all():
+        raise UserInputError(
+            f"quantiles of shape {list(np.shape(quantiles))} have no lower half that is finite: ask the policy for at "
+            "least 2 (num_quantiles)"
+        )
     ordered = np.sort(quantiles)
     half = len(ordered) // 2
     return float(np.mean((ordered[:half] - np.median(ordered)) ** 2))
@@ -125,7 +135,7 @@ class TailVarianceBeta:
         window_steps: the last steps that a tail is compared with.
 
     Raises:
-        UserInputError: unless low is at most high, and the window at least 2.
+        UserInputError: unless low and high are finite, low is at most high, and the window at least 2.
 
     Example:
         >>> controller = TailVarianceBeta(-2.0, 0.0)
@@ -160,5 +170,7 @@ class TailVarianceBeta:
 
 
 def _check_range(low: float, high: float) -> None:
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise UserInputError(f"low={low:g} and high={high:g} are not both finite: give betas of the trained range")
     if not low <= high:
         raise UserInputError(f"low={low:g} is above high={high:g}: a smaller beta is more averse, swap them")

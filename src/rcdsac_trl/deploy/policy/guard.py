@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.sensors.sectors import Sectors
+from rcdsac_trl.deploy.sensors.sectors import Sectors, check_switches
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.limits import (
     MAX_ANGULAR_ACCELERATION,
@@ -88,6 +88,7 @@ class Guard:
 
     def __post_init__(self) -> None:
         """Refuse what is no limit."""
+        check_switches(self, "blind_reverse")
         for name in ("max_speed_m_per_s", "max_reverse_m_per_s", "max_turn_rad_per_s", "margin_m", "reaction_s"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise UserInputError(f"{name}={getattr(self, name)} of the guard must be a number of 0 or more")

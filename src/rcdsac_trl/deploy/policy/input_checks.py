@@ -76,6 +76,11 @@ class InputLimits:
             raise UserInputError(f"max_lost_share={self.max_lost_share} is a share: give 0 or more, and less than 1")
 
 
+def as_given_now(stamps: Stamps) -> Stamps:
+    """Return stamps of any class as ones that stay what they are when the caller's object is filled anew."""
+    return Stamps(stamps.now_s, stamps.scan_s, stamps.waypoints_s, stamps.velocity_s)
+
+
 def check_stamps(stamps: Stamps, last: Stamps | None, limits: InputLimits) -> None:
     """Refuse stamps that are no numbers, old, from the future, or older than the last ones.
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rcdsac_trl.deploy.policy.polyline import Polyline, corners
 from rcdsac_trl.deploy.policy.weights import AgentConfig
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
+from rcdsac_trl.deploy.sensors.sectors import is_finite_number
 from rcdsac_trl.errors import UserInputError
 
 # Waypoints are at most this far ahead along the path: the maps of training are 20 m wide.
@@ -18,6 +19,8 @@ _FARTHEST_M = 75.0
 # Beyond these, a path is not in metres, nor a pose; projected coordinates of maps have seven digits.
 _LONGEST_LEG_M, _LONGEST_PATH_M, _LARGEST_COORDINATE_M = 500.0, 20_000.0, 1e8
 _LARGEST_YAW_RAD = 4.0 * math.pi
+# A path that is thinned more than this cuts through what stands beside it.
+_LARGEST_TOLERANCE_M = 1.0
 # A robot that is farther from where it was on its path was carried away, and begins anew at the nearest place.
 _CARRIED_AWAY_M = 20.0
 # A robot that is so many waypoint radii nearer to the part of the path before the leg it is on was pushed back there.
@@ -48,7 +51,7 @@ class PathFollower:
         reached: whether the goal was reached.
 
     Raises:
-        UserInputError: if the path holds no point, or no numbers, or is not in metres.
+        UserInputError: if the path holds no point, or no numbers, or is not in metres, or the tolerance is not.
 
     Example:
         >>> from types import SimpleNamespace
@@ -58,6 +61,10 @@ class PathFollower:
     """
 
     def __init__(self, path: Any, config: AgentConfig, *, tolerance_m: float = 0.05) -> None:
+        if not (is_finite_number(tolerance_m) and 0.0 <= tolerance_m <= _LARGEST_TOLERANCE_M):
+            raise UserInputError(
+                f"tolerance_m={tolerance_m} is outside [0, {_LARGEST_TOLERANCE_M:g}], a path would be cut: give metres"
+            )
         self._config = config
         self._tolerance_m = tolerance_m
         self._line = self._line_of(path)

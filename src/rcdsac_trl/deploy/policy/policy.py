@@ -13,6 +13,7 @@ from rcdsac_trl.deploy.policy.input_checks import (
     BadInputError,
     InputLimits,
     Stamps,
+    as_given_now,
     check_stamps,
     sectors_of,
     velocity_of,
@@ -20,7 +21,7 @@ from rcdsac_trl.deploy.policy.input_checks import (
 )
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
-from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
+from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number, is_whole_number
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
@@ -40,10 +41,10 @@ def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
     """Return the midpoints of equal parts of [0, 1], float32 [num_quantiles].
 
     Raises:
-        UserInputError: if the number is below 1.
+        UserInputError: if the number is no whole one of 1 or more.
     """
-    if num_quantiles < 1:
-        raise UserInputError(f"num_quantiles={num_quantiles} is below 1: ask for at least one")
+    if not (is_whole_number(num_quantiles) and num_quantiles >= 1):
+        raise UserInputError(f"num_quantiles={num_quantiles} is no whole number of 1 or more: ask for at least one")
     return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
 
 
@@ -199,6 +200,7 @@ class Policy:
             if self._halted:
                 raise BadInputError("stop() was called")
             if stamps is not None:
+                stamps = as_given_now(stamps)
                 check_stamps(stamps, self._last, self.limits)
             sectors = sectors_of(ranges, self._mask, self.limits)
             next_two = waypoints_of(waypoints)
@@ -219,11 +221,11 @@ class Policy:
         stamps: Stamps | None,
     ) -> Command:
         fresh = self._is_due(stamps)
+        forgot = self._steps == 0
+        elapsed_s = self._elapsed_s(stamps)
         self._refused = 0
         self._last = stamps
-        forgot = self._steps == 0
         if fresh:
-            elapsed_s = self._elapsed_s(stamps)
             self._last_fresh = stamps
             self._ask(sectors, next_two, measured, context, elapsed_s)
         return self._command(sectors, measured, fresh, fresh and forgot)
@@ -231,7 +233,7 @@ class Policy:
     def _is_due(self, stamps: Stamps | None) -> bool:
         """Return whether the agent is asked; else the robot goes on as it was told last, guarded anew."""
         last = self._last_fresh
-        if stamps is None or last is None or self._wanted is None:
+        if stamps is None or last is None:
             return True
         shortest, longest = self.config.period_s
         since = stamps.now_s - last.now_s
@@ -242,11 +244,11 @@ class Policy:
         return stamps.scan_s > last.scan_s and since > shortest / 2.0
 
     def _elapsed_s(self, stamps: Stamps | None) -> float:
-        """Return the time since the last observation; without stamps it is about the middle of training's."""
+        """Return the time since the last observation; without stamps a call is the middle of training's periods."""
         if self._steps == 0:
             return 0.0
         if stamps is None or self._last_fresh is None:
-            return sum(self.config.period_s) / 2.0
+            return (1 + self._refused) * sum(self.config.period_s) / 2.0
         return stamps.scan_s - self._last_fresh.scan_s
 
     def _ask(
@@ -261,7 +263,7 @@ class Policy:
         bins = range_observation(sectors.distances_m, self._mask)
         vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
         if self._remembered is not None:
-            vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s).tolist()
+            vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
         if config.context == "collision_weight" and context is not None:
             vectors.append(context)
         self._memories = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._memories)
@@ -300,7 +302,6 @@ class Policy:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""
         self._refused += 1
         self._commanded = (0.0, 0.0)
-        self._wanted = self._told = None
         if self._refused >= _FORGET_AFTER:
             self._forget()
             self._last = self._last_fresh = None  # a clock that was set back is a clock

@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
-from rcdsac_trl.deploy.sensors.sectors import BODY_RADIUS_M, Sectors, bins_of, nearest_by_sector
+from rcdsac_trl.deploy.sensors.sectors import (
+    BODY_RADIUS_M,
+    Sectors,
+    bins_of,
+    check_switches,
+    is_whole_number,
+    nearest_by_sector,
+)
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 
@@ -37,8 +44,9 @@ class CameraPose:
 
     def __post_init__(self) -> None:
         """Refuse what is no pose."""
+        check_switches(self, "optical")
         numbers = (*self.position_m, *self.quaternion, self.view_rad)
-        if len(numbers) != 8 or not all(math.isfinite(value) for value in numbers):
+        if (len(self.position_m), len(self.quaternion)) != (3, 4) or not all(math.isfinite(value) for value in numbers):
             raise UserInputError(f"camera pose {numbers} is not three metres, a quaternion and an angle, all finite")
         if math.hypot(*self.quaternion) < 1e-6:
             raise UserInputError(
@@ -102,6 +110,9 @@ class CloudFilter:
                 f"floor_m={self.floor_m:g} or body_radius_m={self.body_radius_m:g} is beyond the {MAX_RANGE_M:g} m "
                 "that agents see: give metres"
             )
+        for name in ("support", "min_points"):
+            if not is_whole_number(getattr(self, name)):
+                raise UserInputError(f"{name}={getattr(self, name)} counts points: give a whole number")
         if self.support < 1 or self.min_points < 0 or self.body_radius_m < 0.0:
             raise UserInputError(
                 f"support={self.support} must be at least 1, min_points={self.min_points} and "

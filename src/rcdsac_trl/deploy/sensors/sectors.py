@@ -52,7 +52,8 @@ class Mount:
     upside_down: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what is not finite."""
+        """Refuse what is not finite, or in another unit."""
+        check_switches(self, "upside_down")
         if not all(math.isfinite(value) for value in (self.x_m, self.y_m, self.yaw_rad)):
             raise UserInputError(f"mount {self} is not finite: give metres and radians")
         if math.hypot(self.x_m, self.y_m) > _FARTHEST_MOUNT_M:
@@ -70,6 +71,22 @@ def is_finite_number(value: object) -> bool:
         return isinstance(value, _NUMBER) and not isinstance(value, _NO_NUMBER) and math.isfinite(float(value))
     except (OverflowError, TypeError):
         return False
+
+
+def is_whole_number(value: object) -> bool:
+    """Tell whether something is one integer, whatever it may be."""
+    return isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBER)
+
+
+def check_switches(thing: object, *names: str) -> None:
+    """Refuse switches that are neither true nor false: a text such as "no" would count as true.
+
+    Raises:
+        UserInputError: with the first of them.
+    """
+    for name in names:
+        if not isinstance(value := getattr(thing, name), bool | np.bool_):
+            raise UserInputError(f"{name}={value!r} of a {type(thing).__name__} is neither True nor False: give one")
 
 
 def bins_of(angles_rad: NDArray[np.floating]) -> NDArray[np.intp]:

@@ -1,5 +1,6 @@
 """PyBullet without the line that its import prints, and its clients, each with one owner that frees it."""
 
+import ctypes
 import importlib
 import os
 import sys
@@ -25,6 +26,29 @@ def _import_quietly() -> ModuleType:
 
 
 pybullet = _import_quietly()
+
+
+def check_display() -> None:
+    """Refuse a window where there is no display: PyBullet would end the process without a word of ours.
+
+    Raises:
+        UserInputError: if no X server can be reached.
+    """
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        display = None
+    else:
+        x11.XOpenDisplay.restype = ctypes.c_void_p
+        display = x11.XOpenDisplay(None)
+    if display is None:
+        named = os.environ.get("DISPLAY")
+        raise UserInputError(
+            "PyBullet cannot open its window: gui=true needs a display, "
+            + (f"and DISPLAY={named} cannot be reached" if named else "and DISPLAY is not set")
+            + "; use gui=false"
+        )
+    x11.XCloseDisplay(ctypes.c_void_p(display))
 
 
 class OfOneProcess:

@@ -21,7 +21,7 @@ from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.world.maps.generator import Map
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M, segment_clearance
 from rcdsac_trl.world.sim import bodies
-from rcdsac_trl.world.sim.bullet import Client, pybullet
+from rcdsac_trl.world.sim.bullet import Client, check_display, pybullet
 from rcdsac_trl.world.sim.lidar import scan
 from rcdsac_trl.world.sim.movers import Movers, WalkPlanner
 
@@ -114,6 +114,8 @@ class Simulation:
 
     def __init__(self, gui: bool = False) -> None:
         self._gui = gui
+        if gui:
+            check_display()
         self._connection = Client(pybullet.GUI if gui else pybullet.DIRECT)
         self._client = self._connection.number
         if self._client < 0 and not gui:

@@ -69,7 +69,7 @@ class AgentGroup(OfOneProcess):
     ) -> None:
         if split not in SPLITS:
             raise UserInputError(f"split={split!r} does not exist; choose one of {', '.join(SPLITS)}")
-        if not agent_ids or min(agent_ids) < 0:
+        if not agent_ids or not all(isinstance(number, int | np.integer) and number >= 0 for number in agent_ids):
             raise UserInputError(f"agent_ids={list(agent_ids)} must be one or more whole numbers of at least 0")
         self.task = task or TaskSettings()
         mask = sensor_mask(sensor)
@@ -152,6 +152,8 @@ class AgentGroup(OfOneProcess):
 
     def _checked(self, actions: NDArray) -> list[list[float]]:
         values: list[list[float]] = actions.tolist()
+        if actions.dtype.kind not in "fiu":
+            raise UserInputError(f"actions {values} are not numbers but {actions.dtype}: give floats in [-1, 1]")
         limit = 1.0 + _ACTION_TOLERANCE
         # The comparison is false for NaN too. As plain numbers: there are few, and NumPy has a price a call.
         inside = actions.shape == (len(self), ACTION_SIZE) and all(

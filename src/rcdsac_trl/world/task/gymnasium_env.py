@@ -1,5 +1,6 @@
 """The navigation task for Gymnasium, registered as ``RCDSACNavigation-v0`` when this module is imported."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -92,6 +93,8 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin an episode; see the class for ``seed`` and ``options``."""
+        if not isinstance(options, Mapping | None):
+            raise UserInputError(f"options={options!r} are no dictionary: give {{'episode': <number>}}")
         root = seed
         if root is None and not self._has_begun:
             root = self._drawn_seed() if self._seed is None else self._seed
@@ -100,7 +103,7 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         if root is not None:
             self._agents.set_seed(root)
         self._has_begun = True
-        self._agents.reset((0,), (options or {}).get("episode"))
+        self._agents.reset((0,), options.get("episode") if options else None)
         self._steps = 0
         return self._observation(), self._info()
 
