@@ -75,7 +75,8 @@ def speak_anywhere() -> None:
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))  # noqa: SIM115
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if type(stream) is io.TextIOWrapper:
+        # A stream that somebody has put in its place is theirs, and theirs to close.
+        if type(stream) is io.TextIOWrapper and stream is getattr(sys, f"__{name}__"):
             lasting = _Lasting(stream.detach(), encoding=stream.encoding)
             setattr(sys, name, lasting)
             setattr(sys, f"__{name}__", lasting)
