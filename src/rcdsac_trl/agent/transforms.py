@@ -150,6 +150,7 @@ class Mirror:
 
     Args:
         sensed: bins that the sensor has, bool ``[180]``.
+        device: of the batches.
 
     Example:
         >>> from tensordict import TensorDict
@@ -159,19 +160,20 @@ class Mirror:
         [[1.0, -1.0], [1.0, 1.0]]
     """
 
-    def __init__(self, sensed: Tensor) -> None:
-        self._bins = torch.from_numpy(mirrored_bins(sensed.numpy()))
+    def __init__(self, sensed: Tensor, device: torch.device | str = "cpu") -> None:
+        self._bins = torch.from_numpy(mirrored_bins(sensed.numpy())).to(device)
         self._others = {
-            key: (torch.from_numpy(order), torch.from_numpy(sign)) for key, (order, sign) in MIRRORED.items()
+            key: (torch.from_numpy(order).to(device), torch.from_numpy(sign).to(device))
+            for key, (order, sign) in MIRRORED.items()
         }
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Mirror the first half of the sequences ``[B, L + 1]`` in place."""
-        half, device = batch.shape[0] // 2, batch["action"].device
+        half = batch.shape[0] // 2
         seen = batch["range"][:half]
-        seen.copy_(seen[..., self._bins.to(device)])
+        seen.copy_(seen[..., self._bins])
         for key, (order, sign) in self._others.items():
             if key in batch.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)
                 value = batch[key][:half]
-                value.copy_(value[..., order.to(device)] * sign.to(device))
+                value.copy_(value[..., order] * sign)
         return batch

@@ -91,12 +91,11 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
 
 
 def _default_out(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition]) -> Path:
-    name = f"{named.stem}-{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}".removeprefix(
-        "-"
-    )
+    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
     if settings.cross_evaluate:
         name += "-cross"
-    return named.out / "calibration" / "-".join([name, *(str(condition).replace("=", "_") for condition in conditions)])
+    contexts = "".join(f"-{condition}".replace("=", "_") for condition in conditions)
+    return named.folder_of("calibration", f"{name}{contexts}")
 
 
 def _described(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition]) -> dict[str, Any]:

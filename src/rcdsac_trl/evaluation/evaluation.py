@@ -121,7 +121,7 @@ def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: Name
     if named is None:
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
-    return named.out / "evaluation" / f"{named.stem}-{name}{contexts}".removeprefix("-")
+    return named.folder_of("evaluation", f"{name}{contexts}")
 
 
 def _described(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None) -> dict[str, Any]:

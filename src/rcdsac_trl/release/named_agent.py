@@ -58,6 +58,15 @@ class NamedAgent(ABC):
     def stem(self) -> str:
         """What tells its results from those of others in that folder; may be empty."""
 
+    def folder_of(self, kind: str, name: str) -> Path:
+        """Return where results go unless a user says otherwise.
+
+        Args:
+            kind: of the results, such as ``"evaluation"``.
+            name: what tells them from others of this agent.
+        """
+        return self.out / kind / "-".join(part for part in (self.stem, name) if part)
+
     @property
     @abstractmethod
     def training(self) -> bytes | None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from rcdsac_trl.report.read import CONDITION, Episodes, read_evaluation, under
+from rcdsac_trl.report.read import CONDITION, TOLD, Episodes, read_evaluation, under
 
 THINGS = {
     "outer_wall": "outer wall",
@@ -19,7 +19,6 @@ THINGS = {
 """What can be hit, and what it is called in reports."""
 ALL = "all"
 """In the place of a thing: whatever was hit."""
-_TOLD = ("beta", "collision_weight", "beta_controller")
 
 
 def collision_summary(
@@ -104,7 +103,7 @@ def write_collisions(folder: Path) -> str:
     evaluation = read_evaluation(folder)
     episodes, collisions = evaluation.episodes, evaluation.collisions
     assert collisions is not None  # evaluate has just written it
-    by = [key for key in _TOLD if key in episodes]
+    by = [key for key in TOLD if key in episodes]
     summary = collision_summary(collisions, episodes, episodes[by].drop_duplicates(), by)
     summary.to_csv(folder / "collision_summary.csv", index=False, float_format="%.6g")
     shown = summary.dropna(axis="columns", how="all")

@@ -16,7 +16,9 @@ from rcdsac_trl.report.statistics import Array
 
 DESCRIPTION = "evaluation.json"
 COLLISIONS = "collisions.csv"
-CONDITION = ("agent", "sensor", "beta", "collision_weight", "beta_controller")
+TOLD = ("beta", "collision_weight", "beta_controller")
+"""Columns that say what an agent was told, as far as an evaluation has them."""
+CONDITION = ("agent", "sensor", *TOLD)
 """Columns that say what drove an episode."""
 _OF_A_COLLISION = ("thing", "bearing_rad", "bearing_sensed", "unsensed_s")
 _EPISODE = ("train_seed", "map", "episode")

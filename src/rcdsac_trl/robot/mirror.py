@@ -6,11 +6,11 @@ Whatever a robot meets could as well be on its other side, so every experience i
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.robot.observation import NUM_REMEMBERED_MOVERS, NUM_REMEMBERED_SECTORS
+from rcdsac_trl.robot.observation import NUM_REMEMBERED_MOVERS, NUM_REMEMBERED_SECTORS, REMEMBERED_MOVER_SIZE
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 
 _SECTORS = np.arange(NUM_REMEMBERED_SECTORS)
-_MOVERS = np.arange(5 * NUM_REMEMBERED_MOVERS) + NUM_REMEMBERED_SECTORS
+_MOVERS = np.arange(REMEMBERED_MOVER_SIZE * NUM_REMEMBERED_MOVERS) + NUM_REMEMBERED_SECTORS
 
 MIRRORED: dict[str, tuple[NDArray[np.intp], NDArray[np.float32]]] = {
     # The sine of a bearing, an angular velocity, and a velocity to the left change their sign.

@@ -31,7 +31,6 @@ from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.processes import largest_divisor, resolve_num_workers, resolve_processes
 from rcdsac_trl.world.maps.generator import Split
-from rcdsac_trl.world.task.spaces import agent_observations
 
 SPLIT: Split = "train"
 
@@ -112,7 +111,7 @@ def _worker(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Dr
             return agents.rollout(
                 policy,
                 request.map_index,
-                observed=agent_observations(settings.sensor.memory_s),
+                observed=agents.env.agents.observations,
                 happened=HAPPENED,
                 before_step=before_step,
             )

@@ -127,7 +127,7 @@ def make_learner(settings: TrainingSettings, device: str) -> Learner:
     sensed = torch.from_numpy(sensor_mask(settings.sensor.name))
     return Learner(
         replay=make_replay(settings, device),
-        mirror=Mirror(sensed) if settings.learner.mirror else None,
+        mirror=Mirror(sensed, device) if settings.learner.mirror else None,
         loss=loss,
         relabel=make_relabel(settings, device),
         optimizer=make_optimizer(loss, settings.learner),

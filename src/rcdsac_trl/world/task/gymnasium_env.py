@@ -13,7 +13,7 @@ from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task import gymnasium_id
 from rcdsac_trl.world.task.agent_group import AgentGroup
-from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES, agent_observations
+from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 FRAMES_PER_S = 7  # a control period is 0.14 s on average
@@ -67,12 +67,6 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserInputError(f"render_mode={render_mode!r} does not exist; use 'rgb_array' or None")
         world = replace(world or WorldSettings(), **changes)
-        self._observed = agent_observations(world.memory_s)
-        self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
-            {key: _box(key) for key in self._observed}
-        )
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-        self.render_mode = render_mode
         self._agents = AgentGroup(
             world.map_settings,
             world.task,
@@ -84,6 +78,11 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
             first_episode=first_episode,
             gui=world.gui,
         )
+        self.observation_space = gymnasium.spaces.Dict(  # type: ignore[assignment]
+            {key: _box(key) for key in self._agents.observations}
+        )
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+        self.render_mode = render_mode
         self._seed = seed
         self._has_begun = False
         self._steps = 0
@@ -130,7 +129,7 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         return int(np.random.SeedSequence().generate_state(1)[0]) >> 1
 
     def _observation(self) -> dict[str, np.ndarray]:
-        return {key: getattr(self._agents.buffers, key)[0].copy() for key in self._observed}
+        return {key: getattr(self._agents.buffers, key)[0].copy() for key in self._agents.observations}
 
     def _info(self) -> dict[str, Any]:
         buffers = self._agents.buffers
