@@ -33,7 +33,7 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     if settings.run is not None:
         trained.algo.conditions(settings.beta, settings.collision_weight)
     maps, sensor, task = settings.world_of(trained)
-    WorldSettings(maps, task, sensor.name, sensor.memory_s)
+    WorldSettings(maps, task, sensor.name, sensor.memory_s, robot=settings.robot_of(trained))
     _look_at_out(settings.out)
 
 

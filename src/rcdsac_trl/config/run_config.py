@@ -16,6 +16,7 @@ from rcdsac_trl.config.compose import choices
 from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.task.rules import TaskSettings
 
 CONFIG_NAME = "config.yaml"
@@ -73,6 +74,8 @@ class AgentOfRun:
     sensor: SensorSettings
     network: NetworkSettings
     task: TaskSettings
+    # Runs of earlier versions name none.
+    robot: RobotSettings = PAPER
 
 
 def agent_of_run(folder: Path) -> AgentOfRun:
@@ -81,7 +84,7 @@ def agent_of_run(folder: Path) -> AgentOfRun:
     Raises:
         UserInputError: as :func:`settings_of_run`.
     """
-    names = ("algo", "sensor", "network", "task")
+    names = ("algo", "sensor", "network", "task", "robot")
     return _of_run(folder, "run", lambda values: read(AgentOfRun, {n: values[n] for n in names if n in values}))
 
 

@@ -18,6 +18,7 @@ from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.release.named_agent import NamedAgent, named_agent
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.rollout.collisions import COLLISIONS, collision_table
 from rcdsac_trl.rollout.evaluation_pool import Rows, evaluate_maps
 from rcdsac_trl.rollout.make_agent import packed, packed_loss
@@ -52,7 +53,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     trained = default_training() if named is None else named.settings
     spec = _spec(settings, trained)
     if settings.baseline is not None:
-        check_baseline(settings.baseline, spec.world.sensor)
+        check_baseline(settings.baseline, spec.world.sensor, spec.world.robot)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
     simulations = max(1, processes) * spec.world.num_agents
     remedy = "lower num_episodes or num_workers, or end other programs"
@@ -119,6 +120,8 @@ def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
 def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None) -> Path:
     name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
     if named is None:
+        if spec.world.robot != PAPER:
+            name = f"{spec.world.robot.name}-{name}"
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
     return named.folder_of("evaluation", f"{name}{contexts}")
@@ -132,6 +135,7 @@ def _described(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedA
         "measure": None if named is None else trained.algo.distortion.name,
         "sensor": spec.world.sensor,
         "memory_s": spec.world.memory_s,
+        "robot": spec.world.robot.plain(),
         "train_seed": None if named is None else trained.seed,
         **({"checkpoint": None} if named is None else named.described),
         "split": settings.split,
@@ -184,4 +188,5 @@ def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, n
         num_agents=settings.num_episodes * num_conditions,
         num_workers=0,  # a process drives whole maps
         gui=settings.gui,
+        robot=settings.robot_of(trained),
     )

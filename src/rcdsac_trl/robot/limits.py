@@ -1,4 +1,4 @@
-"""The robot's limits and its motor period (paper, section "Actions")."""
+"""Limits and motor period of the paper's robot (section "Actions"); see :class:`.robot_settings.RobotSettings`."""
 
 import math
 

@@ -15,7 +15,7 @@ from rcdsac_trl.deploy.ros import messages
 from rcdsac_trl.deploy.sensors.arrays import described
 from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
 from rcdsac_trl.deploy.sensors.scan import ZeroMeans, check_zero_means
-from rcdsac_trl.deploy.sensors.sectors import Mount
+from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of
 from rcdsac_trl.errors import UserInputError
 
 # Of the frames whose clouds are not expected, so many are named.
@@ -31,9 +31,9 @@ class Driver:
 
     Args:
         policy: that drives.
-        mount: where the laser scanner sits.
+        mount: where the laser scanner sits; None: where the robot's settings have it.
         cameras: pose of each depth camera, by the ``frame_id`` of its clouds.
-        filter_: which points of clouds are obstacles.
+        filter_: which points of clouds are obstacles; None: the defaults, without what is the robot itself.
         zero_means: what the scanner's driver means by a reading of 0; see :class:`Scan`.
 
     Attributes:
@@ -52,9 +52,10 @@ class Driver:
         check_zero_means(zero_means)
         self.policy = policy
         self.beta: float | None = None
-        self._mount = mount or Mount()
+        self._robot = policy.config.robot
+        self._mount = mount or mount_of(self._robot.lidar)
         self._cameras = dict(cameras or {})
-        self._filter = filter_
+        self._filter = filter_ or CloudFilter(body_radius_m=self._robot.body_radius_m)
         self._zero_means = zero_means
         self._faults: dict[str, str] = {}
         self._scan: Any = None
@@ -174,4 +175,4 @@ class Driver:
             return messages.scan_of(self._scan, self._mount, self._zero_means), messages.stamp_s(self._scan)
         clouds = [(messages.points_of(self._clouds[frame]), pose) for frame, pose in self._cameras.items()]
         oldest = min(messages.stamp_s(self._clouds[frame]) for frame in self._cameras)
-        return cloud_sectors(clouds, self._filter), oldest
+        return cloud_sectors(clouds, self._filter, self._robot.lidar.max_range_m), oldest

@@ -81,6 +81,7 @@ class NavigationEnv(OfOneProcess, EnvBase):
             world.task,
             sensor=world.sensor,
             memory_s=world.memory_s,
+            robot=world.robot,
             split=split,
             seed=seed,
             agent_ids=ids,

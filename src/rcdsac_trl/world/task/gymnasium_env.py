@@ -72,6 +72,7 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
             world.task,
             sensor=world.sensor,
             memory_s=world.memory_s,
+            robot=world.robot,
             split=split,
             seed=0 if seed is None else seed,
             agent_ids=(agent_id,),
