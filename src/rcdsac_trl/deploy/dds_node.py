@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, get_args
 import rcdsac_trl
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.sensors.scan import ZeroMeans
-from rcdsac_trl.deploy.sensors.sectors import Mount
+from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of
 from rcdsac_trl.errors import UserInputError
 
 if TYPE_CHECKING:
@@ -56,9 +56,10 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
 
     domain_id = _domain_id(os.environ.get("ROS_DOMAIN_ID") or "0")
     remapped = dict(_renaming(text) for text in args.remap)
-    x_m, y_m, yaw_rad = args.laser
-    mount = Mount(x_m, y_m, yaw_rad, args.laser_upside_down)
-    driver = Driver(rcdsac_trl.load(args.agent), mount=mount, zero_means=args.zero_means)
+    policy = rcdsac_trl.load(args.agent)
+    own = mount_of(policy.robot.lidar)
+    mount = Mount(*(args.laser or (own.x_m, own.y_m, own.yaw_rad)), args.laser_upside_down)
+    driver = Driver(policy, mount=mount, zero_means=args.zero_means)
     driver.policy.check_beta(args.beta)
     driver.beta = args.beta
     return DdsBridge(driver, domain_id, remapped=remapped)
@@ -111,9 +112,8 @@ def _parser() -> argparse.ArgumentParser:
         "--laser",
         type=float,
         nargs=3,
-        default=(0.0, 0.0, 0.0),
         metavar=("X_M", "Y_M", "YAW_RAD"),
-        help="where the scanner sits, from the robot's centre",
+        help="where the scanner sits, from the robot's centre; without it: where the agent's robot has it",
     )
     parser.add_argument("--laser-upside-down", action="store_true", help="the scanner hangs")
     parser.add_argument(

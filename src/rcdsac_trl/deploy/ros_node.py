@@ -25,7 +25,7 @@ import rcdsac_trl
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
 from rcdsac_trl.deploy.ros.topics import readers_of, writers_of
-from rcdsac_trl.deploy.sensors.sectors import Mount
+from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of
 from rcdsac_trl.errors import UserInputError
 
 # One node writes a topic as one type: not every middleware of ROS knows two of one name.
@@ -40,7 +40,6 @@ class PolicyNode(Node):
     def __init__(self) -> None:
         super().__init__("rcdsac_trl")
         agent = str(self.declare_parameter("agent", "").value)
-        x_m, y_m, yaw_rad = (self.declare_parameter(f"laser_{name}", 0.0).value for name in ("x_m", "y_m", "yaw_rad"))
         upside_down = bool(self.declare_parameter("laser_upside_down", False).value)
         zero_means = self.declare_parameter("zero_means", "unknown").value
         self._command_type = str(self.declare_parameter("command_type", "TwistStamped").value)
@@ -48,8 +47,11 @@ class PolicyNode(Node):
             raise UserInputError(
                 f"command_type={self._command_type} is not one of {', '.join(_COMMAND_TYPES)}: choose one"
             )
-        mount = Mount(x_m, y_m, yaw_rad, upside_down)
-        self.driver = Driver(rcdsac_trl.load(agent), mount=mount, zero_means=zero_means)
+        policy = rcdsac_trl.load(agent)
+        own = mount_of(policy.robot.lidar)
+        places = {"x_m": own.x_m, "y_m": own.y_m, "yaw_rad": own.yaw_rad}
+        x_m, y_m, yaw_rad = (self.declare_parameter(f"laser_{name}", value).value for name, value in places.items())
+        self.driver = Driver(policy, mount=Mount(x_m, y_m, yaw_rad, upside_down), zero_means=zero_means)
         config = self.driver.policy.config
         # NaN stands for the agent's own default: ROS parameters know no null.
         self.declare_parameter("beta", math.nan)
