@@ -136,6 +136,17 @@ def test_named_keys_exist() -> None:
 
 def test_every_row_and_choice_is_named() -> None:
     running = (ROOT / "docs" / "running.md").read_text()
-    for group in ("algo", "algo/distortion", "preset", "sensor", "map", "task", "logger", "experiment", "launcher"):
+    for group in (
+        "algo",
+        "algo/distortion",
+        "preset",
+        "robot",
+        "sensor",
+        "map",
+        "task",
+        "logger",
+        "experiment",
+        "launcher",
+    ):
         for path in (CONF_DIR / group).glob("*.yaml"):
             assert f"`{path.stem}`" in running, f"{group}={path.stem}"

@@ -266,6 +266,8 @@ def test_read_refuses_in_one_sentence(changes: dict[str, Any], sentence: str) ->
 # Read by __post_init__ alone, because all it is for is to be refused; and decided upon before settings are made.
 ONLY_CHECKED = {("MapSettings", "version"), ("TaskSettings", "version"), ("TrainingSettings", "resume")}
 PLUMBING = {"__post_init__", "__eq__", "__hash__", "__repr__", "_asdict_inner"}
+# What checks work out first, and everybody else then takes as it was kept.
+KEPT = {"outline", "circumradius_m", "inradius_m", "mask"}
 
 
 @dataclass(frozen=True)
@@ -289,8 +291,8 @@ class Reads:
 def plumbing(frame: FrameType | None) -> bool:
     """Tell whether a read is a part of a dataclass's own doing, however deep below."""
     while frame is not None:
-        if frame.f_code.co_name in PLUMBING:
-            return True
+        if frame.f_code.co_name in PLUMBING | KEPT:
+            return frame.f_code.co_name in PLUMBING
         frame = frame.f_back
     return False
 
@@ -334,7 +336,7 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     turned = "beta_controller=[clearance,tail_variance]"
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
-    evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5")
+    evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5", "robot=jackal")
     every = {(cls.__name__, field.name) for cls in classes for field in fields(cls)}
     assert every - reads.seen == ONLY_CHECKED
 

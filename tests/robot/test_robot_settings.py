@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.config.first_look import look_at_evaluation
 from rcdsac_trl.config.run_config import CONFIG_NAME, agent_of_run, settings_of_run, training_settings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot import limits
@@ -16,6 +17,7 @@ from rcdsac_trl.robot.action import action_of, clip_command, desired_velocities,
 from rcdsac_trl.robot.observation import range_distances, range_observation
 from rcdsac_trl.robot.range_sensor import LidarSettings, sensor_mask
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.training.resume import differing_keys
 from rcdsac_trl.world.task.rules import reward_components
 from tiny import tiny_cfg, yaml_of
 
@@ -59,6 +61,23 @@ def test_a_run_of_before_there_were_robots_drives_the_papers(tiny_run: Path, tmp
     assert "robot:" not in (tmp_path / CONFIG_NAME).read_text()
     assert settings_of_run(tmp_path) == settings_of_run(tiny_run)
     assert agent_of_run(tmp_path).robot == PAPER
+    # Nor is it another run for who continues it, or a sweep that looks for what it has done.
+    assert differing_keys(tmp_path, tiny_cfg("rcdsac_pow")) == ["logger.backends"]
+    assert "robot.radius_m" in differing_keys(tmp_path, tiny_cfg("rcdsac_pow", "robot=turtlebot4"))
+
+
+def test_an_agent_is_evaluated_with_its_own_robot_alone(tiny_run: Path) -> None:
+    def spoken(*overrides: str) -> str:
+        cfg = compose("evaluate", [f"run={tiny_run}", "beta=[-1]", *overrides])
+        with pytest.raises(UserInputError) as raised:
+            look_at_evaluation(cfg)
+        return str(raised.value)
+
+    told = f"is not what {tiny_run} drives: it was trained for robot=paper as it was then, leave robot out"
+    assert spoken("robot=jackal") == f"robot=jackal {told}"
+    assert spoken("robot.lidar.max_range_m=4") == f"robot=paper {told}"
+    look_at_evaluation(compose("evaluate", [f"run={tiny_run}", "beta=[-1]", "robot=paper"]))
+    look_at_evaluation(compose("evaluate", ["baseline=dwa", "robot=jackal", "robot.lidar.x_m=0.1"]))
 
 
 @pytest.mark.parametrize("name", choices("robot"))

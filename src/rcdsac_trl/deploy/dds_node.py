@@ -58,7 +58,8 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
     remapped = dict(_renaming(text) for text in args.remap)
     policy = rcdsac_trl.load(args.agent)
     own = mount_of(policy.robot.lidar)
-    mount = Mount(*(args.laser or (own.x_m, own.y_m, own.yaw_rad)), args.laser_upside_down)
+    x_m, y_m, yaw_rad = args.laser or (own.x_m, own.y_m, own.yaw_rad)
+    mount = Mount(x_m, y_m, yaw_rad, args.laser_upside_down)
     driver = Driver(policy, mount=mount, zero_means=args.zero_means)
     driver.policy.check_beta(args.beta)
     driver.beta = args.beta
