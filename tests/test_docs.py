@@ -45,7 +45,7 @@ def test_the_reward_term_of_contributing_needs_one_file(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "src" / "rcdsac_trl", copy, ignore=shutil.ignore_patterns("__pycache__", "weights"))
     (copy / "conf").symlink_to(CONF_DIR)
     rules = copy / "world" / "task" / "rules.py"
-    text = f"from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY\n{rules.read_text('utf-8')}"
+    text = rules.read_text("utf-8")
     for start, new in (
         ("REWARD_COMPONENTS = ", f"{added}\n{names}"),
         ("    return BASE_REWARD, ", f"    {part}\n    {parts}"),

@@ -171,6 +171,8 @@ def test_the_guard_is_the_robots() -> None:
     assert full(PAPER).guard == Guard() == Guard.of(PAPER)
     assert Policy(agent(), guard=None).guard is None
     assert Policy(agent(robot=CAR), guard=Guard.of(CAR, margin_m=0.1)).guard.margin_m == 0.1  # type: ignore[union-attr]
+    with pytest.raises(UserInputError, match="guard='off' is none: give"):
+        Policy(agent(), guard="off")  # type: ignore[arg-type]
     with pytest.raises(UserInputError, match=r"limits of robot=paper, and this agent drives robot=car: give Guard\.of"):
         Policy(agent(robot=CAR), guard=Guard(radius_m=0.4))
 

@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.limits import (
+    DEAD_BAND_DEG_PER_S,
     MAX_LINEAR_ACCELERATION,
     MAX_LINEAR_VELOCITY,
+    MAX_TURN_ACCELERATION_DEG_PER_S2,
+    MAX_TURN_DEG_PER_S,
     MIN_LINEAR_VELOCITY,
     MOTOR_PERIOD_S,
 )
@@ -91,10 +94,10 @@ class RobotSettings:
     middle_x_m: float = 0.0
     max_speed_m_per_s: float = MAX_LINEAR_VELOCITY
     max_reverse_m_per_s: float = -MIN_LINEAR_VELOCITY
-    max_turn_deg_per_s: float = 90.0
+    max_turn_deg_per_s: float = MAX_TURN_DEG_PER_S
     max_acceleration_m_per_s2: float = MAX_LINEAR_ACCELERATION
-    max_turn_acceleration_deg_per_s2: float = 120.0
-    dead_band_deg_per_s: float = 15.0
+    max_turn_acceleration_deg_per_s2: float = MAX_TURN_ACCELERATION_DEG_PER_S2
+    dead_band_deg_per_s: float = DEAD_BAND_DEG_PER_S
     motor_period_s: float = MOTOR_PERIOD_S
     lidar: LidarSettings = field(default_factory=LidarSettings)
 
@@ -256,7 +259,7 @@ class RobotSettings:
     @cached_property
     def reward_per_turn(self) -> float:
         """What an angular velocity counts in the reward: a full turn costs on every robot what it costs the paper's."""
-        return 90.0 / self.max_turn_deg_per_s
+        return MAX_TURN_DEG_PER_S / self.max_turn_deg_per_s
 
     def stopping_distance_m(self, v: float) -> float:
         """Return how far it drives from a speed, m/s, until it stands, if it brakes at once.

@@ -65,6 +65,8 @@ def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> G
     """
     if guard == "robot":
         return Guard.of(robot)
+    if not isinstance(guard, Guard | None):
+        raise UserInputError(f"guard={guard!r} is none: give Guard.of(robot), None to drive without, or leave it out")
     if guard is not None and guard.robot != robot:
         raise UserInputError(
             f"the guard has the limits of robot={guard.robot.name}, and this agent drives robot={robot.name}: give "
