@@ -6,7 +6,7 @@ import pytest
 import torch
 from test_replay import EPISODE_STEPS, make_replay, numbered_episodes
 
-from rcdsac_trl.storage.replay import SequenceReplay, bytes_per_slot
+from rcdsac_trl.storage.sequence_replay import SequenceReplay, bytes_per_slot
 from rcdsac_trl.storage.replay_files import ReplayFiles, remove_others
 
 SLOTS = EPISODE_STEPS + 1
