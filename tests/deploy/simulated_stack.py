@@ -13,18 +13,17 @@ import sys
 import time
 from typing import Any
 
-import numpy as np
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from walled_room import ANGLE_MIN_RAD, INCREMENT_RAD, ranges_m
 
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
 from rcdsac_trl.deploy.ros import dds_types as ros
 
 PERIOD_S, MOTOR_S = 0.14, 0.02
-ROOM_M = (10.0, 6.0)
 START, GOAL = (1.0, 1.5, 0.6), (8.5, 4.5)
 ACCELERATION = (1.5, math.radians(120.0))
 # Odometry: distances 4 % too long, and a turn to the left that nobody made.
@@ -54,18 +53,10 @@ def stamped(now_s: float, parent: str, child: str, transform: RigidTransform) ->
 
 def scan(now_s: float, robot: RigidTransform) -> ros.LaserScan:
     """See the walls of the room, a ray a degree, from where the scanner is."""
-    x, y, yaw = (robot @ LASER).pose
-    increment = 2.0 * math.pi / 360
-    angles = -math.pi + increment * np.arange(360)
-    cos, sin = np.cos(angles + yaw), np.sin(angles + yaw)
-    with np.errstate(divide="ignore"):
-        across = np.where(cos > 0.0, (ROOM_M[0] - x) / cos, -x / cos)
-        along = np.where(sin > 0.0, (ROOM_M[1] - y) / sin, -y / sin)
-    ranges = np.minimum(np.abs(across), np.abs(along)).tolist()
-    first = float(angles[0])
-    return ros.LaserScan(
-        header(now_s, "laser"), first, first + 359 * increment, increment, range_min=0.1, range_max=12.0, ranges=ranges
-    )
+    last = ANGLE_MIN_RAD + 359 * INCREMENT_RAD
+    ranges = ranges_m(*(robot @ LASER).pose).tolist()
+    stamp = header(now_s, "laser")
+    return ros.LaserScan(stamp, ANGLE_MIN_RAD, last, INCREMENT_RAD, range_min=0.1, range_max=12.0, ranges=ranges)
 
 
 class Robot:
