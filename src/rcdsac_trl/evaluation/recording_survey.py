@@ -124,7 +124,7 @@ def survey(recording: SensorRecording, settings: ReplaySettings) -> Survey:
         began_s=max(found.first_s.values()) - offset_s,
         ended_s=found.last_s - offset_s,
         offset_s=offset_s,
-        trajectory=np.array(found.way),
+        trajectory=np.array([*found.way, found.end]),
         odom_frame=found.odom_frame,
     )
 
@@ -138,6 +138,7 @@ class _Findings:
         self.first_s: dict[str, float] = {}
         self.last_s = -math.inf
         self.way: list[tuple[float, float]] = []
+        self.end: tuple[float, float] = (math.nan, math.nan)
         self.odom_frame, self.base_frame, self.scan_frame = "", "", ""
         self.frames: dict[str, str] = {}
         self.transforms = TransformBuffer()
@@ -170,6 +171,7 @@ class _Findings:
         x, y, _ = messages.pose_of_odometry(message)
         if not self.way or math.dist(self.way[-1], (x, y)) >= _STEP_M:
             self.way.append((x, y))
+        self.end = (x, y)
         self.odom_frame = named(str(message.header.frame_id))
         self.base_frame = str(getattr(message, "child_frame_id", "")) or "base_link"
 

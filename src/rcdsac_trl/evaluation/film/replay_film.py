@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rcdsac_trl.deploy.sensors.sectors import Sectors
 from rcdsac_trl.evaluation.film.video import Frame
 from rcdsac_trl.evaluation.recorded_drive import RecordedPeriod
 from rcdsac_trl.robot.range_sensor import NUM_BINS
@@ -28,10 +29,11 @@ def frames(periods: Sequence[RecordedPeriod]) -> Iterator[Frame]:
     floor = Map("clutter", float(np.ptp(poses[:, :2], axis=0).max()) + 2.0 * _VIEW_M, (), (), ())
     renderer = Renderer(_SIDE_PX, _VIEW_M)
     trail: list[tuple[float, float]] = []
-    pose, waypoints, distances_m = tuple(poses[0]), np.empty((0, 2)), np.full(NUM_BINS, np.inf)
+    pose, waypoints = tuple(poses[0]), np.empty((0, 2))
+    sectors = Sectors(np.full(NUM_BINS, np.inf), np.zeros(NUM_BINS, dtype=np.bool_))
     for period in periods:
         if period.situation is not None and period.sectors is not None:
-            pose, distances_m = period.situation.pose, period.sectors.distances_m
+            pose, sectors = period.situation.pose, period.sectors
             cos, sin = np.cos(pose[2]), np.sin(pose[2])
             waypoints = period.situation.waypoints @ np.array([[cos, sin], [-sin, cos]]) + pose[:2] + shift
         here = (pose[0] + shift[0], pose[1] + shift[1])
@@ -39,8 +41,8 @@ def frames(periods: Sequence[RecordedPeriod]) -> Iterator[Frame]:
         scene = Scene(
             map=floor,
             pose=(*here, pose[2]),
-            distances_m=distances_m,
-            sensor_mask=np.ones(NUM_BINS, dtype=np.bool_),
+            distances_m=sectors.distances_m,
+            sensor_mask=sectors.covered,
             waypoints=waypoints,
             movers=np.empty((0, 3)),
             trail=trail,
