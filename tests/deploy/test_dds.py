@@ -257,6 +257,21 @@ def test_every_transform_counts_and_static_ones_are_those_of_before() -> None:
     assert "the localisation is lost" in robot.hears("drive_status")[0].data
 
 
+def test_a_pose_topic_says_where_the_robot_is_where_that_is_asked_for(folder: Path) -> None:
+    arguments = [str(folder), "--localisation", "pose", "--localisation-timeout", "0.5", "--remap", "pose:=/amcl_pose"]
+    bridge, robot = dds_node.bridge_of(dds_node._parser().parse_args(arguments)), Robot(pose="amcl_pose")
+    message = plan(10.0)
+    message.header.frame_id = "map"
+    robot.say(plan=message, odom=odometry(10.0, 1.0), scan=laser(10.0))
+    assert "no pose of the robot has come yet" in str(bridge.step(10.0).reason)
+    here = ros.PoseWithCovariance(ros.Pose(ros.Point(x=3.5)))
+    robot.say(pose=ros.PoseWithCovarianceStamped(header(10.0, "map"), here))
+    assert bridge.step(10.0).fresh
+    assert bridge.driver.situation is not None
+    assert bridge.driver.situation.pose == (3.5, 0.0, 0.0)
+    assert "the localisation is lost" in str(bridge.step(10.6).reason)
+
+
 def test_clouds_come_on_topics_of_their_own() -> None:
     camera = endpoint(DataWriter, "front/points", ros.PointCloud2, Rule.Reliability.Reliable(10**9))
     driver, robot = Driver(Policy(agent()), cameras={"cam": 1.7}), Robot()
