@@ -106,6 +106,7 @@ def test_there_are_commands_of_every_verb() -> None:
         "search",
         "course",
         "publish",
+        "replay",
     }
 
 

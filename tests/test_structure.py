@@ -243,6 +243,7 @@ def test_every_key_of_the_configuration_is_explained() -> None:
         "export.yaml",
         "calibrate.yaml",
         "course.yaml",
+        "replay.yaml",
         "report.yaml",
         "draw_maps.yaml",
         "plot_training.yaml",

@@ -226,8 +226,11 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
 @pytest.mark.parametrize(
     ("verb", "given", "key"),
     [
-        *((verb, "run=", "run") for verb in ("evaluate", "calibrate", "course", "export", "plot_training")),
-        *((verb, "out=", "out") for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps")),
+        *((verb, "run=", "run") for verb in ("evaluate", "calibrate", "course", "export", "plot_training", "replay")),
+        *(
+            (verb, "out=", "out")
+            for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps", "replay")
+        ),
         ("plot_training", "out='  '", "out"),
         ("course", "run=[sac-narrow,'']", "run"),
         ("report", "runs=['']", "runs"),

@@ -16,8 +16,10 @@ from rcdsac_trl.config.evaluation_settings import (
     PublishSettings,
 )
 from rcdsac_trl.config.named_folder import default_training, find_agent
+from rcdsac_trl.config.replay_settings import ReplaySettings
 from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.deploy import find_weights
+from rcdsac_trl.deploy.recordings.open_recording import open_recording
 from rcdsac_trl.system.resources import check_out, check_writable
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
@@ -85,6 +87,19 @@ def look_at_publication(cfg: DictConfig) -> None:
         agent_of_run(Path(run))
     for folder in (settings.weights, settings.results):
         check_writable(Path(folder))
+
+
+def look_at_replay(cfg: DictConfig) -> None:
+    """Refuse settings, an agent and a recording that `replay` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, ReplaySettings)
+    find_agent(settings.run)
+    assert settings.recording is not None
+    open_recording(Path(settings.recording))
+    _look_at_out(settings.out)
 
 
 def _look_at_out(out: str | None) -> None:

@@ -24,8 +24,8 @@ from rcdsac_trl.rollout.map_evaluator import EvaluationSpec, map_evaluator
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint import Checkpoints, Generators, load_average, rotate
 from rcdsac_trl.storage.checkpoint_record import DamagedError, Progress, Saved, best_damage, folder_name, newest
-from rcdsac_trl.storage.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.storage.replay_files import ReplayFiles
+from rcdsac_trl.storage.sequence_replay import SequenceReplay, replay_bytes
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.processes import check_may_start_processes, resolve_processes, resolve_processes_beside
