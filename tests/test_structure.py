@@ -188,7 +188,9 @@ def test_the_table_of_keys_is_what_the_environment_has() -> None:
     )
     found: dict[str, tuple[int, torch.dtype]] = {}
     for name in ("rcdsac_pow", "rcwr"):
-        env = environment(world, row(name), split="train", seed=0, agent_ids=range(2), memory=NetworkSettings().memory)
+        env = environment(
+            world, row(name), split="train", seed=0, agent_ids=range(2), state_size=NetworkSettings().state_size
+        )
         specs = all_specs(env)
         assert {spec.shape[:-1] for spec in specs.values()} == {env.batch_size}
         found |= {key: (spec.shape[-1], spec.dtype) for key, spec in specs.items()}

@@ -62,7 +62,7 @@ def test_a_worker_drives_as_the_environment_with_its_transforms(
     conditions = CONDITIONS.get(row or "", [Condition()])
     agents = 4 * len(conditions)
     world = WorldSettings(settings.map, settings.task, "narrow", num_agents=agents, num_workers=workers)
-    memory, observed = settings.network.memory, ("range", "velocity")
+    state_size, observed = settings.network.state_size, ("range", "velocity")
 
     def policy() -> TensorDictModuleBase:
         if row is None:
@@ -71,14 +71,14 @@ def test_a_worker_drives_as_the_environment_with_its_transforms(
         noise.begin(0, "test")
         return make_policy(make_loss(settings, "cpu").actor_network, noise, "cpu")
 
-    worker = evaluation_worker(world, algo, conditions, "evaluation", 0, 4, memory)
+    worker = evaluation_worker(world, algo, conditions, "evaluation", 0, 4, state_size)
     env = environment(
         world,
         algo,
         split="evaluation",
         seed=0,
         agent_ids=[0, 1, 2, 3] * len(conditions),
-        memory=memory,
+        state_size=state_size,
         conditions=[condition for condition in conditions for _ in range(4)],
     )
     context = [] if algo is None or algo.context_key is None else [algo.context_key]

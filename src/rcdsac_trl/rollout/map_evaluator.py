@@ -101,8 +101,8 @@ def map_evaluator(
     threads = torch.get_num_threads()
     runtime.set_threads(spec.threads)
     algo = None if actor is None else spec.trained.algo
-    memory = spec.trained.network.memory
-    worker = evaluation_worker(spec.world, algo, spec.conditions, spec.split, spec.seed, spec.num_episodes, memory)
+    state_size = spec.trained.network.state_size
+    worker = evaluation_worker(spec.world, algo, spec.conditions, spec.split, spec.seed, spec.num_episodes, state_size)
     # An episode's noise is its own: the same under every condition, whichever they are and in whatever order.
     agent_ids = [*range(spec.num_episodes)] * len(spec.conditions)
     noise = AgentNoise(agent_ids)

@@ -60,14 +60,14 @@ class RolloutWorker:
     Args:
         env: holds the agents.
         sampler: what the agents are told; None: nothing.
-        memory: size of the policy's recurrent state.
+        state_size: size of the policy's recurrent state.
         steps: length of an episode.
     """
 
-    def __init__(self, env: NavigationEnv, sampler: EpisodeSampler | None, *, memory: int, steps: int) -> None:
+    def __init__(self, env: NavigationEnv, sampler: EpisodeSampler | None, *, state_size: int, steps: int) -> None:
         self.env = env
         self.sampler = sampler
-        self.memory = memory
+        self.state_size = state_size
         self.steps = steps
 
     def rollout(
@@ -96,7 +96,7 @@ class RolloutWorker:
         # Made once: the agents write into the same arrays at every step.
         now = TensorDict({key: torch.from_numpy(written[key]) for key in agents.observations} | context, [number])
         now["is_init"] = torch.ones(number, 1, dtype=torch.bool, device="cpu")
-        now[STATE_KEY] = torch.zeros(number, self.memory, dtype=torch.float32, device="cpu")
+        now[STATE_KEY] = torch.zeros(number, self.state_size, dtype=torch.float32, device="cpu")
         seen = {key: _empty_rows(written[key], self.steps + 1) for key in observed}
         done = {key: _empty_rows(written[key], self.steps) for key in happened}
         done["action"] = np.empty((number, self.steps, ACTION_SIZE), np.float32)
