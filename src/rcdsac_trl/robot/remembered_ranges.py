@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.dead_reckoning import DeadReckoning
+from rcdsac_trl.robot.foreseen_clearance import foreseen_nearness
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.observation import (
+    NUM_FORESEEN_COMMANDS,
     NUM_REMEMBERED_MOVERS,
     NUM_REMEMBERED_SECTORS,
     REMEMBERED_MOVER_SIZE,
@@ -51,7 +53,7 @@ class RememberedRanges:
         >>> ranges_m[0] = 0.48
         >>> told = remembered.observe(ranges_m, v=0.0, omega=0.0, elapsed_s=0.0)
         >>> told.shape, round(float(told[0]), 6)
-        ((46,), 1.0)
+        ((65,), 1.0)
     """
 
     def __init__(self, sensed: NDArray[np.bool_], memory_s: float) -> None:
@@ -111,11 +113,13 @@ class RememberedRanges:
                 read either, so what is remembered there stays.
 
         Returns:
-            float32 [46]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
+            float32 [65]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
             degrees, counter-clockwise from straight ahead: log10(2.8 m / (distance - 0.2 m)), 0 where nothing is known
             within 3 m.
             Then, for each of the two nearest things that move: its nearness, that times the cosine and the sine of its
             bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
+            Last, for each of 19 commands, how near it would lead to all that; see
+            :func:`~rcdsac_trl.robot.foreseen_clearance.foreseen_nearness`.
         """
         self._reckoning.move(v, omega, elapsed_s)
         sensed = self._sensed if measured is None else self._sensed & measured
@@ -125,11 +129,15 @@ class RememberedRanges:
         moving = self._tracks.moving
         told = np.zeros(REMEMBERED_SIZE, np.float32)
         points, cells, rows = self._points, self._cells, self._rows
-        number = _forget(points, cells, rows, self._number, pose, time_s - self._memory_s, seen_m, sensed, moving)
-        self._number = _add(points, cells, rows, number, pose, time_s, seen_m, sensed, moving)
+        oldest_s = time_s - self._memory_s
+        number = _forget(points, cells, rows, self._number, pose, oldest_s, seen_m, sensed, moving)
+        # As old as what is forgotten when the mover's track ends.
+        of_mover_s = oldest_s + min(self._tracks.settings.coast_s, self._memory_s)
+        self._number = _add(points, cells, rows, number, pose, time_s, of_mover_s, seen_m, sensed, moving)
         self._moving = moving
         _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose)
         _tell_movers(told, moving, pose)
+        told[-NUM_FORESEEN_COMMANDS:] = foreseen_nearness(points[: self._number], moving, pose, v, omega)
         return told
 
 
@@ -155,7 +163,7 @@ def _forget(
         if not gone:
             bin_ = math.floor((math.atan2(y - pose[1], x - pose[0]) - pose[2]) / BIN_RAD) % NUM_BINS
             seen_through = distance_m < min(seen_m[bin_], MAX_RANGE_M) - _CLEARING_MARGIN_M
-            gone = (sensed[bin_] and seen_through) or _is_of_a_mover(x, y, moving, False)
+            gone = (sensed[bin_] and seen_through) or _is_of_a_seen_mover(x, y, moving)
         if gone:
             rows[cells[row, 0], cells[row, 1]] = -1
             number -= 1
@@ -173,34 +181,33 @@ def _add(
     number: int,
     pose: np.ndarray,
     time_s: float,
+    of_mover_s: float,
     seen_m: np.ndarray,
     sensed: np.ndarray,
     moving: np.ndarray,
 ) -> int:
-    """Put a point into the middle of each sector that sees one, but for movers that are seen; return how many are."""
+    """Put a point into the middle of each sector that sees one, those of movers with a time of their own."""
     for bin_ in range(NUM_BINS):
         if not sensed[bin_] or seen_m[bin_] >= MAX_RANGE_M:
             continue
         bearing = pose[2] + (bin_ + 0.5) * BIN_RAD
         x, y = pose[0] + seen_m[bin_] * math.cos(bearing), pose[1] + seen_m[bin_] * math.sin(bearing)
-        if _is_of_a_mover(x, y, moving, True):
-            continue
         i, j = math.floor(y / _CELL_M) % _NUM_CELLS, math.floor(x / _CELL_M) % _NUM_CELLS
         row = rows[i, j]
         if row < 0:
             row = rows[i, j] = number
             cells[row, 0], cells[row, 1] = i, j
             number += 1
-        points[row, 0], points[row, 1], points[row, 2] = x, y, time_s
+        points[row, 0], points[row, 1] = x, y
+        points[row, 2] = of_mover_s if _is_of_a_seen_mover(x, y, moving) else time_s
     return number
 
 
 @njit
-def _is_of_a_mover(x: float, y: float, moving: np.ndarray, seen_now: bool) -> bool:
-    """Say whether a point belongs to what moves; where that is itself not seen its place is a guess."""
+def _is_of_a_seen_mover(x: float, y: float, moving: np.ndarray) -> bool:
+    """Say whether a point belongs to what is seen moving."""
     for mover_x, mover_y, _, _, radius, unseen_s in moving:
-        near = math.hypot(x - mover_x, y - mover_y) < radius + _MOVER_MARGIN_M
-        if near and (unseen_s == 0.0 or not seen_now):
+        if unseen_s == 0.0 and math.hypot(x - mover_x, y - mover_y) < radius + _MOVER_MARGIN_M:
             return True
     return False
 
