@@ -32,7 +32,11 @@ def invisible_shape(client: int) -> int:
 
 
 def add_static(client: int, map: Map, visual: int) -> None:
-    """Add walls and clutter as few compound bodies of shapes that lie near each other."""
+    """Add walls and clutter as few compound bodies of shapes that lie near each other.
+
+    They are plain rigid bodies ("maximal coordinates"): what stands has no joints, and a step does not visit each of
+    them as it would a multibody. Contact is bit for bit the same.
+    """
     shapes: list[Box | Cylinder] = [*map.boxes, *map.cylinders]
     for first in range(0, len(shapes), SHAPES_PER_BODY):
         group = shapes[first : first + SHAPES_PER_BODY]
@@ -50,7 +54,7 @@ def add_static(client: int, map: Map, visual: int) -> None:
             ],
             physicsClientId=client,
         )
-        pybullet.createMultiBody(0.0, shape, visual, physicsClientId=client)
+        pybullet.createMultiBody(0.0, shape, visual, useMaximalCoordinates=1, physicsClientId=client)
 
 
 def add_robot(client: int, start_pose: tuple[float, float, float], visual: int) -> int:

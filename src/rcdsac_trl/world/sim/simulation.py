@@ -22,7 +22,7 @@ from rcdsac_trl.world.maps.generator import Map
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M, segment_clearance
 from rcdsac_trl.world.sim import bodies
 from rcdsac_trl.world.sim.bullet import Client, check_display, pybullet
-from rcdsac_trl.world.sim.lidar import scan
+from rcdsac_trl.world.sim.lidar import NearSegments, scan
 from rcdsac_trl.world.sim.movers import Movers, WalkPlanner
 
 SIMULATION_BYTES = 28_000_000
@@ -169,7 +169,7 @@ class Simulation:
         self._mover_bodies = list(
             zip(bodies.add_movers(client, movers.discs, visual), movers.radii.tolist(), strict=True)
         )
-        self._segments = np.ascontiguousarray(map.segments(), dtype=np.float64)
+        self._segments = NearSegments(map.segments())
         self._boxes, static = map.solids()
         # The last rows are the movers' own, so that they are sensed where they walk.
         self._circles = np.concatenate([static, movers.discs])
@@ -290,7 +290,8 @@ class Simulation:
             :func:`rcdsac_trl.world.sim.lidar.sector_distances`.
         """
         distances = np.empty(NUM_BINS)
-        self._clearance_m = scan(distances, *self._pose, self._segments, self._circles)
+        x, y, yaw = self._pose
+        self._clearance_m = scan(distances, x, y, yaw, self._segments.near(x, y), self._circles)
         return distances
 
     def close(self) -> None:
