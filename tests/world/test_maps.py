@@ -335,7 +335,8 @@ def test_mixed_is_the_default_and_static_differs_in_movers_only() -> None:
 
 
 def test_contact_sheet_draws_every_map() -> None:
-    figure = contact_sheet(MapSettings(), "validation", seed=1, count=5)
+    maps = [generate_map(MapSettings(), "validation", seed=1, index=index) for index in range(5)]
+    figure = contact_sheet(maps, "validation", seed=1)
     assert len(figure.axes) == 5
     for index, axes in enumerate(figure.axes):
         map_ = generate_map(MapSettings(), "validation", 1, index)

@@ -14,6 +14,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world.maps.generator import SPLITS, MapSettings, Split
+from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.sim.simulation import Simulation
@@ -36,7 +37,7 @@ class AgentGroup(OfOneProcess):
     It can be neither copied nor pickled: its simulations live in PyBullet.
 
     Args:
-        map_settings: how maps are generated.
+        map_settings: what maps are made from, the generator's settings or those of files.
         task: rules of the task.
         sensor: one of :data:`rcdsac_trl.robot.range_sensor.SENSORS`.
         split: which of the disjoint map sets.
@@ -56,7 +57,7 @@ class AgentGroup(OfOneProcess):
 
     def __init__(
         self,
-        map_settings: MapSettings | None,
+        map_settings: MapSource | None,
         task: TaskSettings | None,
         *,
         sensor: str,
