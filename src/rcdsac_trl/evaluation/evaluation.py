@@ -30,7 +30,7 @@ from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
-from rcdsac_trl.world.maps.map_source import with_digests
+from rcdsac_trl.world.maps.map_source import check_maps, with_digests
 from rcdsac_trl.world.sim.bullet import check_display
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -54,6 +54,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     named = None if settings.run is None else named_agent(settings.run, settings.checkpoint)
     trained = default_training() if named is None else named.settings
     chosen = settings.world_of(trained)
+    check_maps(chosen.maps, chosen.task.min_path_m)
     worlds = [] if chosen.barn is None else chosen.barn.worlds()[: settings.num_maps]
     num_maps = len(worlds) or settings.num_maps
     spec = _spec(settings, trained, chosen)
