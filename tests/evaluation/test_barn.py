@@ -46,7 +46,7 @@ def evaluate_pursuit(worlds: Path, out: Path, *given: str) -> Path:
 def test_pursuit_arrives_where_nothing_is_in_the_way_and_collides_with_what_nobody_knows(
     worlds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = evaluate_pursuit(worlds, tmp_path / "out", "map.mapped=false")
+    folder = evaluate_pursuit(worlds, tmp_path / "out")
     assert sorted(path.name for path in folder.iterdir()) == ["barn.json", "runs.csv", "summary.csv", "worlds.csv"]
     runs = pd.read_csv(folder / "runs.csv")
     assert runs[["world", "run"]].to_numpy().tolist() == [[6, 0], [6, 1], [12, 0], [12, 1]]
@@ -73,10 +73,11 @@ def test_pursuit_arrives_where_nothing_is_in_the_way_and_collides_with_what_nobo
     assert "pursuit" in told
     assert "2 of the protocol's 50 worlds" in told
     assert "DRL-VO" in told
+    assert "knew the cylinders" not in told
 
 
 def test_what_the_planner_knows_is_driven_around(worlds: Path, tmp_path: Path) -> None:
-    runs = pd.read_csv(evaluate_pursuit(worlds, tmp_path / "out") / "runs.csv")
+    runs = pd.read_csv(evaluate_pursuit(worlds, tmp_path / "out", "map.mapped=true") / "runs.csv")
     assert (runs["success"] == 1).all()
     blocked = runs[runs["world"] == 12]["time_s"].min()
     assert blocked > runs[runs["world"] == 6]["time_s"].max()
@@ -126,9 +127,10 @@ def test_conditions_are_told_apart(tmp_path: Path) -> None:
         for run in range(3)
     ]
     pd.DataFrame(rows).to_csv(tmp_path / "runs.csv", index=False)
-    (tmp_path / "barn.json").write_text('{"agent": "rcdsac_pow"}')
+    (tmp_path / "barn.json").write_text('{"agent": "rcdsac_pow", "map": {"mapped": true}}')
     told = write_barn(tmp_path).splitlines()
     assert [line.split()[:2] for line in told[1:3]] == [["rcdsac_pow", "beta=-2"], ["rcdsac_pow", "beta=-1"]]
+    assert "here the planner knew the cylinders" in told[-1]
     assert pd.read_csv(tmp_path / "summary.csv")["time_s"].tolist() == [22.0, 21.0]
     assert len(pd.read_csv(tmp_path / "worlds.csv")) == 4
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from world_files import FREE, OCCUPIED, UNKNOWN, room, write_map_server, write_world
 
+from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.files.barn import GOAL, START, BarnMapSettings, optimal_time_s
@@ -179,6 +181,18 @@ def test_a_map_of_ours_written_by_hand(tmp_path: Path) -> None:
     ]
     unknown = building(path, mapped=False)
     assert not any(piece.mapped for piece in (*unknown.boxes, *unknown.cylinders))
+
+
+def test_the_example_of_the_documents_is_a_map(tmp_path: Path) -> None:
+    document = (CONF_DIR.parent / "docs" / "your-building.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```json\n(.*?)^```", document, re.M | re.S)
+    path = tmp_path / "example.json"
+    path.write_text(example)
+    check_file_maps(FileMapSettings(path=str(path)), 4.0)
+    map_ = building(path)
+    assert (len(map_.boxes), len(map_.cylinders), len(map_.movers)) == (7, 1, 1)  # 8 m x 6 m is no square
+    planner = Planner(map_)
+    assert planner.path_length((1.0, 1.0), (7.0, 1.0)) > 8.0  # around the wall in the middle
 
 
 def test_a_generated_map_that_was_written_is_read_as_it_was(tmp_path: Path) -> None:
@@ -470,7 +484,7 @@ def test_the_worlds_of_the_protocol(tmp_path: Path) -> None:
     settings = BarnMapSettings("barn", path=str(tmp_path))
     assert [world.name for world in settings.worlds()] == ["world_6.world", "world_12.world"]
     files = settings.files()
-    assert (files.start, files.goal) == (START, GOAL)
+    assert (files.start, files.goal, files.mapped) == (START, GOAL, False)
     world = settings.worlds()[0]
     with pytest.raises(
         UserInputError, match=r"path_6\.npy is missing, and BARN's score needs it: get them from github"

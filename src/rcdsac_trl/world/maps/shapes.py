@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -88,6 +89,14 @@ class Mover:
     speed_m_per_s: float
 
 
+def _sides(boxes: Sequence[Box]) -> NDArray[np.float64]:
+    """Return the sides of boxes, float64 [n, 4]: x0, y0, x1, y1 in m."""
+    if not boxes:
+        return np.empty((0, 4))
+    corners = np.stack([box.corners() for box in boxes])
+    return np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 4)
+
+
 Kind = Literal["outer_wall", "inner_wall", "mapped_clutter", "unmapped_clutter"]
 """What something that stands is; see :meth:`Map.kind`."""
 
@@ -133,11 +142,12 @@ class Map:
         Args:
             mapped_only: leave out what the planner does not know.
         """
-        boxes = [box for box in self.boxes if box.mapped or not mapped_only]
-        if not boxes:
-            return np.empty((0, 4))
-        corners = np.stack([box.corners() for box in boxes])
-        return np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 4)
+        return _sides([box for box in self.boxes if box.mapped]) if mapped_only else self._all_sides
+
+    @cached_property
+    def _all_sides(self) -> NDArray[np.float64]:
+        """The sides of all boxes: every simulation of the map asks for them."""
+        return _sides(self.boxes)
 
     def circles(self, mapped_only: bool = False) -> NDArray[np.float64]:
         """Return the cylinders as float64 [m, 3]: x, y, radius in m.

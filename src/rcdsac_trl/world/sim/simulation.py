@@ -157,7 +157,8 @@ class Simulation:
         )
         pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
         visual = -1 if self._gui else bodies.invisible_shape(client)
-        bodies.add_static(client, map, visual)
+        self._static = bodies.StaticBodies(client, map, visual, whole=True if self._gui else None)
+        self._static.follow(*start_pose[:2])
         self._robot = bodies.add_robot(client, start_pose, visual)
         x, y, yaw = start_pose
         self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
@@ -207,6 +208,7 @@ class Simulation:
         """
         client, robot, movers = self._client, self._robot, self._movers
         x, y, yaw = self._pose
+        self._static.follow(x, y)
         v_c, omega_c = self._v_c, self._omega_c
         cos, sin = math.cos(yaw), math.sin(yaw)
         gap_m = movers.step(x, y)

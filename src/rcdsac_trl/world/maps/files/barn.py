@@ -42,7 +42,7 @@ class BarnMapSettings:
     Attributes:
         protocol: ``"barn"``.
         path: the folder of the worlds, those of other numbers may lie there as well.
-        mapped: whether the planner knows the cylinders.
+        mapped: whether the planner knows the cylinders; the protocol gives nobody a map.
         clearance_margin_m: what is kept free beyond the robot's radius, m.
         waypoint_clearance_m: clearance that waypoints keep where that costs little, m.
 
@@ -52,7 +52,7 @@ class BarnMapSettings:
 
     protocol: Literal["barn"]
     path: str | None = None
-    mapped: bool = True
+    mapped: bool = False
     clearance_margin_m: float = CLEARANCE_MARGIN_M
     waypoint_clearance_m: float = WAYPOINT_CLEARANCE_M
 
