@@ -145,6 +145,13 @@ def test_missing_worlds_are_told_before_anything_is_driven(tmp_path: Path) -> No
         look_at_evaluation(compose("evaluate", ["baseline=pursuit", "map=barn", f"map.path={tmp_path}"]))
 
 
+def test_a_missing_path_is_told_before_anything_is_driven(worlds: Path, tmp_path: Path) -> None:
+    (worlds / "path_12.npy").unlink()
+    given = ["baseline=pursuit", "map=barn", f"map.path={worlds}", f"out={tmp_path / 'out'}"]
+    with pytest.raises(UserInputError, match=r"path_12\.npy is missing, and BARN's score needs it"):
+        make_evaluation(compose("evaluate", given))
+
+
 def test_the_task_of_the_protocol(worlds: Path) -> None:
     given = ["baseline=pursuit", "map=barn", f"map.path={worlds}", "task.motor_steps=[5,8]"]
     chosen = read_config(compose("evaluate", given), EvaluationSettings).world_of(default_training())

@@ -263,6 +263,21 @@ def test_environments_begin_at_the_start_and_go_to_the_goal(tmp_path: Path) -> N
     drawn.close()
 
 
+def test_a_new_environment_reads_what_the_file_says_now(tmp_path: Path) -> None:
+    path = write_map_server(tmp_path / "a.yaml", room(60, 80))
+    settings = FileMapSettings(path=str(path), start=(2.0, 2.0, 0.0))
+    nearest = []
+    for distance in (6, 12):
+        cells = room(60, 80)
+        cells[30:50, 20 + distance] = OCCUPIED
+        write_map_server(path, cells)
+        env = NavigationEnv(map_settings=settings, agent_ids=(0,), sensor="full")
+        env.reset()
+        nearest.append(env.agents.scene(0).distances_m[0])
+        env.close()
+    assert nearest == pytest.approx([0.6, 1.2])
+
+
 # ------------------------------------------------------------------------------------------------ digests
 def test_digests_are_those_of_sha256sum_and_a_changed_file_is_refused(tmp_path: Path) -> None:
     path = write_map_server(tmp_path / "a.yaml", room(60, 60))

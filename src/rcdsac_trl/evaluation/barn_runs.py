@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -13,20 +13,35 @@ from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS, table_of
 from rcdsac_trl.world.maps.files.barn import TIME_LIMIT_S, optimal_time_s, score, world_number
 
 
-def barn_runs(worlds: Sequence[Path], rows: Rows) -> Findings:
+class World(NamedTuple):
+    """What the metrics need of one of BARN's worlds: its number, and its optimal time, s."""
+
+    number: int
+    optimal_s: float
+
+
+def timed(worlds: Sequence[Path]) -> list[World]:
+    """Return the numbers and the optimal times of worlds.
+
+    Raises:
+        UserInputError: a world's path is missing.
+    """
+    return [World(world_number(world), optimal_time_s(world)) for world in worlds]
+
+
+def barn_runs(worlds: Sequence[World], rows: Rows) -> Findings:
     """Return the table of runs through BARN's worlds, ``runs.csv``.
 
     Args:
-        worlds: their files, in the order of the maps.
+        worlds: in the order of the maps.
         rows: one an episode, with navigation metrics and collisions.
     """
     measured = table_of([rows])
     conditions = [key for key in CONDITION_COLUMNS if key in measured]
-    optimal_s = [optimal_time_s(world) for world in worlds]
     runs = [
         {key: row[key] for key in conditions}
-        | {"world": world_number(worlds[row["map"]]), "run": row["episode"]}
-        | run_metrics(row, optimal_s[row["map"]])
+        | {"world": worlds[row["map"]].number, "run": row["episode"]}
+        | run_metrics(row, worlds[row["map"]].optimal_s)
         for row in measured.to_dict("records")
     ]
     return Findings({"runs.csv": pd.DataFrame(runs).to_csv(index=False, float_format="%.6g")})

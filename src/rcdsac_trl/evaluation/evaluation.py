@@ -14,7 +14,7 @@ from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.barn_runs import barn_runs
+from rcdsac_trl.evaluation.barn_runs import barn_runs, timed
 from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
@@ -55,7 +55,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     trained = default_training() if named is None else named.settings
     chosen = settings.world_of(trained)
     check_maps(chosen.maps, chosen.task.min_path_m)
-    worlds = [] if chosen.barn is None else chosen.barn.worlds()[: settings.num_maps]
+    worlds = [] if chosen.barn is None else timed(chosen.barn.worlds()[: settings.num_maps])
     num_maps = len(worlds) or settings.num_maps
     spec = _spec(settings, trained, chosen)
     if settings.baseline is not None:

@@ -14,7 +14,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world.maps.generator import SPLITS, MapSettings, Split
-from rcdsac_trl.world.maps.map_source import MapSource
+from rcdsac_trl.world.maps.map_source import MapSource, with_digests
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.sim.simulation import Simulation
@@ -74,9 +74,11 @@ class AgentGroup(OfOneProcess):
             raise UserInputError(f"agent_ids={list(agent_ids)} must be one or more whole numbers of at least 0")
         self.task = task or TaskSettings()
         mask = sensor_mask(sensor)
+        # As the files are now: what is read of them is kept, and another environment may find others.
+        maps = with_digests(map_settings or MapSettings())
         self._agents = [
             NavigationAgent(
-                map_settings or MapSettings(),
+                maps,
                 self.task,
                 mask,
                 split,
