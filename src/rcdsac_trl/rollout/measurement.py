@@ -86,14 +86,18 @@ def measure_map(
 
 
 class _TripsEnded:
-    """Tells whether every agent has reached a goal or touched something since the episode began."""
+    """Tells whether every agent has reached a goal or touched something before this step.
+
+    So a step follows the last of them: who watches agents as they act, as a film does, sees how it ended.
+    """
 
     def __init__(self, num_agents: int) -> None:
         self._ended = np.zeros(num_agents, np.bool_)
 
     def __call__(self, written: Mapping[str, NDArray]) -> bool:
+        over = bool(self._ended.all())
         self._ended |= (written["contact"] | written["goal_reached"])[:, 0]
-        return bool(self._ended.all())
+        return over
 
 
 def table_of(maps: Iterable[Rows]) -> pd.DataFrame:
