@@ -18,7 +18,7 @@ from rcdsac_trl.world.maps.geometry import (
     pull_tight,
     segment_clearance,
 )
-from rcdsac_trl.world.maps.grid_search import cheapest_path, nearest_cell
+from rcdsac_trl.world.maps.grid_search import cheapest_path, farthest_cell, nearest_cell
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.maps.shapes import solid_arrays
 
@@ -156,6 +156,19 @@ def test_the_heap_grows_when_it_must() -> None:
     steps = np.hypot(np.diff(rows), np.diff(columns))
     mean = (weight[rows[1:], columns[1:]] + weight[rows[:-1], columns[:-1]]) / 2
     assert (steps * mean).sum() == pytest.approx(expected)
+
+
+def test_farthest_cell_is_the_end_of_the_longest_way() -> None:
+    free = np.ones((7, 5), bool)
+    free[2, :4] = free[4, 1:] = False  # a way that winds: right, left, right
+    assert farthest_cell(free, 0) == (6 * 5 + 4, pytest.approx(3 * (2 + 2 * math.sqrt(2))))
+    rng = stream(0, "test")
+    free = rng.random((30, 40)) < 0.7
+    start = int(np.flatnonzero(free)[0])
+    costs = MCP_Geometric(np.where(free, 1.0, -1.0)).find_costs([divmod(start, 40)])[0].ravel()
+    reached = np.where(np.isfinite(costs), costs, -1.0)
+    cell, length = farthest_cell(free, start)
+    assert (length, reached[cell]) == pytest.approx((reached.max(), reached.max()))
 
 
 def test_nearest_cell_by_hand() -> None:
