@@ -135,6 +135,19 @@ def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pyt
     assert not multiprocessing.active_children()
 
 
+def test_episodes_that_end_early_are_the_beginning_of_whole_ones() -> None:
+    settings = tiny_settings("sac")
+    worker = evaluation_worker(settings.training_world, None, [Condition()], "validation", 0, 2, memory=4)
+    calls = iter(range(100))
+    drive = partial(worker.rollout, PursuitPolicy(), 1, observed=("pose",), happened=("contact",))
+    whole, short = drive(), drive(ended=lambda written: "contact" in written and next(calls) == 6)
+    worker.close()
+    assert whole.tensordict().shape == (2, STEPS)
+    assert short.tensordict().shape == (2, 7)
+    for key in ("action", "pose", ("next", "pose"), ("next", "contact")):
+        assert torch.equal(short.tensordict()[key], whole.tensordict()[key][:, :7])
+
+
 def test_episodes_are_views_of_what_was_seen() -> None:
     steps = np.arange(6.0, dtype=np.float32).reshape(1, 6, 1)
     driven = EpisodeBatch(

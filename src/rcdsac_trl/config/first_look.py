@@ -21,6 +21,7 @@ from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.deploy import find_weights
 from rcdsac_trl.deploy.recordings.open_recording import open_recording
 from rcdsac_trl.system.resources import check_out, check_writable
+from rcdsac_trl.world.maps.map_source import check_maps
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 
@@ -34,8 +35,9 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     trained = default_training() if settings.run is None else find_agent(settings.run).settings()
     if settings.run is not None:
         trained.algo.conditions(settings.beta, settings.collision_weight)
-    maps, sensor, task = settings.world_of(trained)
-    WorldSettings(maps, task, sensor.name, sensor.memory_s)
+    chosen = settings.world_of(trained)
+    WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s)
+    check_maps(chosen.maps, chosen.task.min_path_m)
     _look_at_out(settings.out)
 
 
@@ -47,7 +49,8 @@ def look_at_calibration(cfg: DictConfig) -> None:
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is not None:
-        find_agent(settings.run).settings()
+        trained = find_agent(settings.run).settings()
+        check_maps(trained.map, trained.task.min_path_m)
     _look_at_out(settings.out)
 
 

@@ -12,7 +12,7 @@ from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
-from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
@@ -112,7 +112,7 @@ class TrainingSettings:
 
     algo: AlgoSettings
     sensor: SensorSettings
-    map: MapSettings
+    map: MapSource
     task: TaskSettings
     logger: LoggerSettings
     resume: str | None

@@ -58,6 +58,7 @@ class EvaluationSpec:
         detailed: measure the ways driven and say of each collision what was hit, too.
         controller: settings of controllers, which then tell all agents beta; None: nothing turns it.
         baseline: what drives where there is no actor.
+        one_trip: drive to the first goal alone; see :func:`~rcdsac_trl.rollout.measurement.measure_map`.
     """
 
     trained: TrainingSettings
@@ -72,6 +73,7 @@ class EvaluationSpec:
     detailed: bool = False
     controller: ControllerSettings | None = None
     baseline: str = PURSUIT
+    one_trip: bool = False
 
 
 class Agent(NamedTuple):
@@ -131,6 +133,7 @@ def map_evaluator(
             map_index=map_index,
             sampled=spec.sampled,
             controlled=spec.controller is not None,
+            one_trip=spec.one_trip,
             before_step=before_step,
             more=partial(_all, more, map_index) if more else None,
         )

@@ -5,7 +5,7 @@ worker therefore steps the environment's own arrays, and writes what is asked fo
 numbers are, bit by bit, those of the environment with its transforms.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -78,6 +78,7 @@ class RolloutWorker:
         observed: Sequence[str],
         happened: Sequence[str],
         before_step: Callable[[], None] = interruption_point,
+        ended: Callable[[Mapping[str, NDArray]], bool] | None = None,
     ) -> EpisodeBatch:
         """Drive one episode with every agent.
 
@@ -87,6 +88,8 @@ class RolloutWorker:
             observed: keys to return of the observations.
             happened: keys to return of what the steps led to.
             before_step: called before each step.
+            ended: given what the agents wrote after each step; returns whether all episodes may end now. None: they
+                take their full length.
         """
         agents, number = self.env.agents, len(self.env.agents)
         agents.reset(range(number), episode)
@@ -111,6 +114,10 @@ class RolloutWorker:
             if (state := now.get(("next", STATE_KEY), None)) is not None:
                 now[STATE_KEY] = state
             now["is_init"].fill_(False)
+            if ended is not None and ended(written):
+                seen = {key: value[:, : step + 2] for key, value in seen.items()}
+                done = {key: value[:, : step + 1] for key, value in done.items()}
+                break
         return EpisodeBatch(seen, done, {key: value.numpy() for key, value in context.items()})
 
     def close(self) -> None:

@@ -19,7 +19,8 @@ from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.robot.observation import Point, distance_and_bearing
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.seeding import stream
-from rcdsac_trl.world.maps.generator import MapSettings, Split, generate_map
+from rcdsac_trl.world.maps.generator import Split
+from rcdsac_trl.world.maps.map_source import MapSource, make_map
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.render import Scene
@@ -36,16 +37,16 @@ _TRAIL_STEPS = 1000
 
 
 @lru_cache(maxsize=_MAPS_KEPT)
-def load_map(settings: MapSettings, split: Split, seed: int, index: int) -> tuple[Map, Planner]:
+def load_map(source: MapSource, split: Split, seed: int, index: int) -> tuple[Map, Planner]:
     """Return a map and its planner, shared by all agents of this process.
 
     Args:
-        settings: how maps are generated.
+        source: what maps are made from.
         split: which of the disjoint map sets.
         seed: root seed.
         index: which map; episode ``k`` of every agent takes place on map ``k``.
     """
-    map_ = generate_map(settings, split, seed, index)
+    map_ = make_map(source, split, seed, index)
     return map_, Planner(map_)
 
 
@@ -61,7 +62,7 @@ class NavigationAgent:
     The simulation is made at the first reset, so that making an agent costs nothing.
 
     Args:
-        map_settings: how maps are generated.
+        map_settings: what maps are made from.
         task: rules of the task.
         mask: bins that the sensor has, bool [180].
         split: which of the disjoint map sets.
@@ -92,7 +93,7 @@ class NavigationAgent:
 
     def __init__(
         self,
-        map_settings: MapSettings,
+        map_settings: MapSource,
         task: TaskSettings,
         mask: NDArray[np.bool_],
         split: Split,
@@ -114,9 +115,7 @@ class NavigationAgent:
         """Begin an episode, on the map of the same number."""
         self._seed, self._episode = seed, episode
         self._map, self._planner = load_map(self._map_settings, self._split, seed, episode)
-        rng = self._stream("start")
-        x, y = self._planner.sample_free(rng).tolist()
-        self.pose = (x, y, rng.uniform(-math.pi, math.pi))
+        self.pose = x, y, _ = self._map.start or self._drawn_start()
         self._motor_steps = draw_motor_steps(self._task, self._split, seed, episode, self._agent_id)
         if self._simulation is None:
             self._simulation = Simulation(gui=self._gui)
@@ -200,11 +199,21 @@ class NavigationAgent:
     def _stream(self, purpose: str, *index: int) -> np.random.Generator:
         return stream(self._seed, f"{purpose}/{self._split}", self._episode, self._agent_id, *index)
 
+    def _drawn_start(self) -> Pose:
+        rng = self._stream("start")
+        x, y = self._planner.sample_free(rng).tolist()
+        return x, y, rng.uniform(-math.pi, math.pi)
+
     def _draw_goal(self) -> None:
-        """Draw the next goal relative to the last one, and plan to it from where the robot is."""
-        rng = self._stream("goal", self._goals_drawn)
+        """Draw the next goal relative to the last one, and plan to it from where the robot is.
+
+        The first is the map's own, where it has one.
+        """
+        goal: Point | NDArray[np.float64] | None = self._map.goal if self._goals_drawn == 0 else None
+        if goal is None:
+            rng = self._stream("goal", self._goals_drawn)
+            goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
         self._goals_drawn += 1
-        goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
         # As plain floats: single numbers out of arrays are slow, and every step reads some.
         self._path = [(x, y) for x, y in self._planner.waypoints(self.pose[:2], goal).tolist()]
         self._goal = self._path[-1]

@@ -8,6 +8,7 @@ from rcdsac_trl.robot.range_sensor import SENSORS, check_memory
 from rcdsac_trl.system.checks import positive
 from rcdsac_trl.system.processes import resolve_num_workers
 from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.task.rules import TaskSettings
 
 
@@ -16,7 +17,7 @@ class WorldSettings:
     """What an environment is made of.
 
     Attributes:
-        map_settings: how maps are generated.
+        map_settings: what maps are made from, the generator's settings or those of files.
         task: rules of the task.
         sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
         memory_s: for how long an agent is told of points that it saw and no longer sees, s; 0: not at all, as in the
@@ -36,7 +37,7 @@ class WorldSettings:
         10
     """
 
-    map_settings: MapSettings = field(default_factory=MapSettings)
+    map_settings: MapSource = field(default_factory=MapSettings)
     task: TaskSettings = field(default_factory=TaskSettings)
     sensor: str = "narrow"
     memory_s: float = 0.0
