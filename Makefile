@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 # Programs of benchmarks/, in the order they run.
-BENCHMARKS := deploy learner collection evaluation planners whole_job scaling_learner scaling_world
+BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job scaling_learner scaling_world
 
 # Tests run side by side, a worker a core; a file's tests stay together, since they share what they have trained.
 # Files begin in the order of tests/conftest.py: those that take longest first.

@@ -47,7 +47,7 @@ def main() -> None:
         weights = read_weights(weights_folder)
     policy, unguarded = Policy(weights), Policy(weights, guard=None)
     actor, critics = ActorStep.of_weights(weights), CriticStep(weights, torch.from_numpy(policy.fractions))
-    memory, memories = torch.zeros(1, actor.encoder.memory_size), torch.zeros(2, 1, actor.encoder.memory_size)
+    memory, memories = torch.zeros(1, actor.encoder.state_size), torch.zeros(2, 1, actor.encoder.state_size)
     took: dict[str, list[float]] = {"act": [], "act_without_guard": [], "torch_networks_alone": []}
     rng = np.random.default_rng(0)
     assert policy.guard == Guard()

@@ -72,7 +72,7 @@ def replay_bytes(steps: int) -> int:
     from tensordict import TensorDict
 
     from rcdsac_trl.robot.range_sensor import sensor_mask
-    from rcdsac_trl.storage.replay import SequenceReplay
+    from rcdsac_trl.storage.sequence_replay import SequenceReplay
     from rcdsac_trl.world.task.spaces import Buffers
 
     episode_steps = 1000

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from rcdsac_trl.storage.replay import SequenceReplay
+from rcdsac_trl.storage.sequence_replay import SequenceReplay
 from rcdsac_trl.system import process_pool
 from rcdsac_trl.training.learner import Learner
 from rcdsac_trl.training.run_log import RunLog

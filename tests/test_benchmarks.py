@@ -71,6 +71,16 @@ def test_planners(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert all(found[f"{name}_ms_per_decision"] > 0 for name in ("dwa", "mppi"))
 
 
+def test_file_maps(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    program = load("file_maps")
+    monkeypatch.setattr(load("bench_world"), "NUM_AGENTS", 2)
+    run(program, monkeypatch, "--json", "--side-m=20", "--repeats=1", "--steps=5")
+    found = printed(capsys)
+    assert found["boxes"] > 100
+    assert found["step_rate_of_default"] > 0
+    assert found["floor_m2"] > 100  # the rooms have doors
+
+
 def test_learner(load: Any) -> None:
     common, program = load("bench_common"), load("learner")
     learner = common.make_learner("rcdsac_pow", SMALL)

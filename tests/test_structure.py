@@ -21,6 +21,8 @@ from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.robot.range_sensor import SENSORS
 from rcdsac_trl.rollout.environments import environment
+from rcdsac_trl.world.maps.files.barn import BarnMapSettings
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -188,7 +190,9 @@ def test_the_table_of_keys_is_what_the_environment_has() -> None:
     )
     found: dict[str, tuple[int, torch.dtype]] = {}
     for name in ("rcdsac_pow", "rcwr"):
-        env = environment(world, row(name), split="train", seed=0, agent_ids=range(2), memory=NetworkSettings().memory)
+        env = environment(
+            world, row(name), split="train", seed=0, agent_ids=range(2), state_size=NetworkSettings().state_size
+        )
         specs = all_specs(env)
         assert {spec.shape[:-1] for spec in specs.values()} == {env.batch_size}
         found |= {key: (spec.shape[-1], spec.dtype) for key, spec in specs.items()}
@@ -243,11 +247,14 @@ def test_every_key_of_the_configuration_is_explained() -> None:
         "export.yaml",
         "calibrate.yaml",
         "course.yaml",
+        "replay.yaml",
         "report.yaml",
         "draw_maps.yaml",
         "plot_training.yaml",
         "search.yaml",
         "map/mixed.yaml",
+        "map/file.yaml",
+        "map/barn.yaml",
         "robot/paper.yaml",
         "experiment/grid.yaml",
     ):
@@ -274,9 +281,14 @@ def test_the_code_has_the_defaults_of_the_configuration() -> None:
 
 
 def test_every_map_set_gives_every_setting() -> None:
+    of_files = {"file.yaml": FileMapSettings(path="a.yaml"), "barn.yaml": BarnMapSettings("barn", path="worlds")}
     for path in sorted((CONF_DIR / "map").glob("*.yaml")):
-        assert list(conf(f"map/{path.name}")) == list(asdict(MapSettings())), path.name
-        MapSettings(**conf(f"map/{path.name}"))
+        values = conf(f"map/{path.name}")
+        if path.name in of_files:
+            assert values == as_lists(asdict(of_files[path.name])) | {"path": None}, path.name
+        else:
+            assert list(values) == list(asdict(MapSettings())), path.name
+            MapSettings(**values)
 
 
 def test_every_measure_has_its_file_with_the_range_of_the_code() -> None:

@@ -12,11 +12,16 @@ from omegaconf import DictConfig
 from rcdsac_trl.cli import Command
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.progress import Work, counted
-from rcdsac_trl.system.resources import check_picture
+from rcdsac_trl.system.resources import check_picture, check_writable
 from rcdsac_trl.world.maps.contact_sheet import contact_sheet
-from rcdsac_trl.world.maps.generator import MapSettings, Split
+from rcdsac_trl.world.maps.files.barn import BarnMapSettings
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings, described
+from rcdsac_trl.world.maps.files.map_files import map_files
+from rcdsac_trl.world.maps.generator import Split
+from rcdsac_trl.world.maps.map_source import MapSource, make_map
 
 _MAX_COUNT = 100
 
@@ -33,7 +38,8 @@ class Sheet:
     count: int
     split: Split
     seed: int
-    map: MapSettings
+    map: MapSource | BarnMapSettings
+    json: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
@@ -41,14 +47,27 @@ class Sheet:
         if not 1 <= self.count <= _MAX_COUNT:
             raise UserInputError(f"count={self.count} is not a whole number from 1 to {_MAX_COUNT}: use one")
         check_least("seed", self.seed, 0)
+        if self.json is not None:
+            check_writable(Path(self.json))
 
     def run(self) -> None:
-        """Write the picture."""
+        """Write the picture, and the maps where that is wanted."""
+        source = self.map.files() if isinstance(self.map, BarnMapSettings) else self.map
+        if isinstance(source, FileMapSettings):
+            for file in map_files(source.path)[: self.count]:
+                print(described(source, file))
         out = Path(self.out)
         out.parent.mkdir(parents=True, exist_ok=True)
         with Work(f"{counted(self.count, 'map')}, then their picture, {out}", self.count, "map") as work:
-            contact_sheet(self.map, self.split, self.seed, self.count, drawn=work.end_unit).savefig(out, dpi=130)
+            maps = [make_map(source, self.split, self.seed, index) for index in range(self.count)]
+            contact_sheet(maps, self.split, self.seed, drawn=work.end_unit).savefig(out, dpi=130)
         print(f"drew {self.count} maps: {out}")
+        if self.json is not None:
+            folder = Path(self.json)
+            folder.mkdir(parents=True, exist_ok=True)
+            for index, map_ in enumerate(maps):
+                atomic.write(folder / f"{self.split}-{index}.json", map_.to_json().encode())
+            print(f"wrote them as JSON: {folder}")
 
 
 def make_sheet(cfg: DictConfig) -> Sheet:

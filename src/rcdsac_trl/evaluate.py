@@ -5,7 +5,7 @@ from rcdsac_trl.cli import Command
 main = Command(
     "evaluate",
     "rcdsac_trl.evaluation.evaluation:make_evaluation",
-    describe="rcdsac_trl.report.collision_report:write_collisions",
+    describe="rcdsac_trl.report.barn_report:describe_evaluation",
     look="rcdsac_trl.config.first_look:look_at_evaluation",
 )
 

@@ -43,7 +43,7 @@ def learnt(row: str) -> dict[str, Tensor]:
         split="train",
         seed=0,
         agent_ids=range(AGENTS),
-        memory=settings.network.memory,
+        state_size=settings.network.state_size,
     )
     keys = ("range", "waypoint", "velocity")
     happened = ("reward", "reward_components", "contact", "goal_reached")
@@ -82,7 +82,7 @@ def rolled_out() -> tuple[TensorDictBase, dict[str, tuple]]:
         split="train",
         seed=0,
         agent_ids=range(AGENTS),
-        memory=settings.network.memory,
+        state_size=settings.network.state_size,
     )
     episodes = env.rollout(4, PursuitPolicy()).cpu()
     specs = {

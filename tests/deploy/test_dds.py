@@ -32,7 +32,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from rcdsac_trl.deploy.ros import dds_types as ros
-from rcdsac_trl.deploy.ros.dds_bridge import READS, UNSTAMPED, WRITES, DdsBridge
+from rcdsac_trl.deploy.ros.dds_bridge import CLOUD, READS, UNSTAMPED, WRITES, DdsBridge
 
 PERIOD_S = 0.14
 # Its own domain and tag: whatever else speaks DDS on this machine or beside it is not met. No multicast, loopback only.
@@ -70,7 +70,8 @@ def same(theirs: Any, ours: Any) -> None:
         for one, other in zip(theirs, ours, strict=True):
             same(one, other)
     elif hasattr(theirs, "__msgtype__"):
-        names = [part.name for part in fields(theirs) if part.name != "__msgtype__"]
+        # What is in capitals is a constant of the definition.
+        names = [part.name for part in fields(theirs) if part.name != "__msgtype__" and not part.name.isupper()]
         assert [part.name for part in fields(ours)] == names
         package, _, kind = theirs.__msgtype__.split("/")
         assert type(ours).__idl__.idl_transformed_typename == f"{package}::msg::dds_::{kind}_"
@@ -80,7 +81,7 @@ def same(theirs: Any, ours: Any) -> None:
         np.testing.assert_equal(ours, theirs)
 
 
-@pytest.mark.parametrize("kind", [*READS.values(), *WRITES.values(), UNSTAMPED], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*READS.values(), CLOUD, *WRITES.values(), UNSTAMPED], ids=lambda kind: kind.__name__)
 @pytest.mark.parametrize("release", ["ROS2_FOXY", "ROS2_HUMBLE", "ROS2_JAZZY"])
 def test_types_and_bytes_are_those_of_ros(kind: Any, release: str) -> None:
     typesys = pytest.importorskip("rosbags.typesys")
@@ -134,7 +135,11 @@ class Robot:
         def topic(name: str, kind: Any) -> Topic:
             return Topic(participant, f"rt/{remapped.get(name, name)}", kind)
 
-        self._writers = {name: DataWriter(participant, topic(name, kind), rules) for name, kind in READS.items()}
+        kept = Qos(Rule.Reliability.Reliable(10**9), Rule.Durability.TransientLocal, Rule.History.KeepLast(1000))
+        self._writers = {
+            name: DataWriter(participant, topic(name, kind), kept if name == "tf_static" else rules)
+            for name, kind in READS.items()
+        }
         self._readers = {name: DataReader(participant, topic(name, kind), rules) for name, kind in WRITES.items()}
 
     def say(self, **messages: Any) -> None:
@@ -224,6 +229,77 @@ def test_word_that_there_is_nothing_more_is_no_message() -> None:
     assert "scan_s is 0.40 s old" in str(bridge.step(10.4).reason)
 
 
+# ------------------------------------------------------------------------------------------------ frames and clouds
+def transform(now_s: float, parent: str, child: str, x_m: float, z_m: float = 0.0) -> ros.TFMessage:
+    place = ros.Transform(ros.Vector3(x_m, 0.0, z_m))
+    return ros.TFMessage([ros.TransformStamped(header(now_s, parent), child, place)])
+
+
+def test_every_transform_counts_and_static_ones_are_those_of_before() -> None:
+    """Two publishers of /tf between two steps, and two of /tf_static that spoke before the node was there."""
+    latched = [Rule.Reliability.Reliable(10**9), Rule.Durability.TransientLocal, Rule.History.KeepLast(1)]
+    publishers = [endpoint(DataWriter, "tf_static", ros.TFMessage, *latched) for _ in range(2)]
+    publishers[0].write(transform(0.0, "base_link", "mast", 0.1))
+    publishers[1].write(transform(0.0, "mast", "laser", 0.05))
+    driver, robot = Driver(Policy(agent())), Robot()
+    bridge = DdsBridge(driver, DOMAIN)
+    message = plan(10.0)
+    message.header.frame_id = "map"
+    robot.say(plan=message, odom=odometry(10.0, 1.0), scan=laser(10.0))
+    robot.say(tf=transform(10.0, "map", "odom", 2.0))
+    robot.say(tf=transform(10.0, "world", "map", 4.0))
+    assert bridge.step(10.0).fresh
+    assert driver.situation is not None
+    assert driver.situation.pose == (3.0, 0.0, 0.0)
+    assert driver.situation.ranges.mount.x_m == pytest.approx(0.15)  # type: ignore[union-attr]
+    assert [message.data for message in robot.hears("drive_status")] == ["driving"]
+    assert "the localisation is lost" in str(bridge.step(11.5).reason)
+    assert "the localisation is lost" in robot.hears("drive_status")[0].data
+
+
+def test_a_pose_topic_says_where_the_robot_is_where_that_is_asked_for(folder: Path) -> None:
+    arguments = [str(folder), "--localisation", "pose", "--localisation-timeout", "0.5", "--remap", "pose:=/amcl_pose"]
+    bridge, robot = dds_node.bridge_of(dds_node._parser().parse_args(arguments)), Robot(pose="amcl_pose")
+    message = plan(10.0)
+    message.header.frame_id = "map"
+    robot.say(plan=message, odom=odometry(10.0, 1.0), scan=laser(10.0))
+    assert "no pose of the robot has come yet" in str(bridge.step(10.0).reason)
+    here = ros.PoseWithCovariance(ros.Pose(ros.Point(x=3.5)))
+    robot.say(pose=ros.PoseWithCovarianceStamped(header(10.0, "map"), here))
+    assert bridge.step(10.0).fresh
+    assert bridge.driver.situation is not None
+    assert bridge.driver.situation.pose == (3.5, 0.0, 0.0)
+    assert "the localisation is lost" in str(bridge.step(10.6).reason)
+
+
+def test_clouds_come_on_topics_of_their_own() -> None:
+    camera = endpoint(DataWriter, "front/points", ros.PointCloud2, Rule.Reliability.Reliable(10**9))
+    driver, robot = Driver(Policy(agent()), cameras={"cam": 1.7}), Robot()
+    bridge = DdsBridge(driver, DOMAIN, clouds=["/front/points"])
+    points = np.zeros((400, 3), "<f4")
+    points[:, 0], points[:, 1] = 1.5, np.linspace(-1.5, 1.5, 400)
+    parts = [ros.PointField(name, 4 * place, 7, 1) for place, name in enumerate("xyz")]
+    camera.write(ros.PointCloud2(header(10.0, "cam"), 1, 400, parts, False, 12, 4800, list(points.tobytes()), True))
+    robot.say(plan=plan(10.0), odom=odometry(10.0), tf=transform(10.0, "base_link", "cam", 0.2, 0.4))
+    assert bridge.step(10.0).reason is None
+    assert driver.situation is not None
+    assert driver.situation.ranges.distances_m[0] == pytest.approx(1.7, abs=1e-3)  # type: ignore[union-attr]
+    assert "nobody writes /scan" not in bridge.report()
+    with pytest.raises(UserInputError, match="cloud:=a b is no topic of ROS"):
+        DdsBridge(driver, DOMAIN, clouds=["a b"])
+
+
+def test_simulated_time_moves_it_on_a_period_at_a_time() -> None:
+    robot, bridge = Robot(), DdsBridge(Driver(Policy(agent())), DOMAIN, simulated=True)
+    assert "nobody writes /clock" not in bridge.report()
+    ticks = dds_node._simulated_ticks(bridge, PERIOD_S)
+    found = []
+    for now_s in (10.0, 10.07, 10.14, 10.2, 10.28, 3.0):  # the last: the simulation was started again
+        robot.say(clock=ros.Clock(header(now_s, "").stamp))
+        found.append(next(ticks))
+    assert found == [10.0, None, 10.14, None, 10.28, 3.0]
+
+
 # ------------------------------------------------------------------------------------------------ who is there
 def endpoint(make: Any, name: str, kind: Any, *rules: Any) -> Any:
     participant = DomainParticipant(DOMAIN)
@@ -293,6 +369,9 @@ def folder(tmp_path: Path) -> Path:
         (["--remap", "scan:=front scan"], {}, "scan:=front scan is no topic of ROS"),
         (["--remap", "scan:=/odom"], {}, "scan and odom are both called /odom: give each a topic of its own"),
         (["--laser", "0", "nan", "0"], {}, "is not finite"),
+        (["--camera", "cam", "points", "wide"], {}, "--camera cam: a view of wide is no number: give radians"),
+        (["--camera", "cam", "p q", "1.5"], {}, "cloud:=p q is no topic of ROS"),
+        (["--localisation-timeout", "-1"], {}, "localisation_timeout_s=-1.0 must be a positive number of seconds"),
         ([], {"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID=233 is no domain: give a whole number from 0 to 232"),
         ([], {"ROS_DOMAIN_ID": "-1"}, "ROS_DOMAIN_ID=-1 is no domain"),
         # In a domain of its own: what a process knows of one that it is in, it does not read again.
@@ -332,7 +411,7 @@ def test_without_cyclonedds_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
 
 
 def test_zeros_are_open_space_where_the_command_line_says_so(folder: Path) -> None:
-    for arguments, reads_zero in (([], True), (["--zero-means", "nothing"], False)):
+    for arguments, reads_zero in (([], True), (["--zero-means", "far"], False)):
         bridge = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), *arguments]))
         robot = Robot()
         message = laser(10.0)
@@ -346,6 +425,7 @@ class Told:
 
     def __init__(self) -> None:
         self.topics = {"scan": "scan"}
+        self.simulated = False
         self.driver = Driver(Policy(agent(period_s=(0.0, 0.0))))
         self.steps = 0
 

@@ -298,7 +298,8 @@ def test_the_node_only_uses_what_the_core_has() -> None:
             module = __import__(str(node.module), fromlist=["_"])
             assert all(hasattr(module, alias.name) for alias in node.names)
     subscribed = [node.args[1] for node in ast.walk(tree) if isinstance(node, ast.Call) and is_subscription(node)]
-    assert [ast.literal_eval(name) for name in subscribed] == ["scan", "odom", "plan"]  # dds_node's, and Nav2's
+    named = [ast.literal_eval(topic) for topic in subscribed if isinstance(topic, ast.Constant)]
+    assert named == ["scan", "odom", "plan", "/tf", "/tf_static", "pose"]  # dds_node's, and Nav2's
     driver = Driver(Policy(agent()))
     used = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     for name in (text.removeprefix("self.driver.") for text in used if text.startswith("self.driver.")):

@@ -99,7 +99,7 @@ def test_read_only_arrays_are_read_and_nothing_given_is_changed() -> None:
     assert Policy(agent()).act(**values).reason is None
     ranges = np.where(np.arange(360) % 3, [5.0, -math.inf, 20.0] * 120, 0.0)
     before = ranges.copy()
-    Policy(agent()).act(**given(ranges=turned(ranges, zero_means="nothing")))
+    Policy(agent()).act(**given(ranges=turned(ranges, zero_means="far")))
     np.testing.assert_array_equal(ranges, before)
 
 

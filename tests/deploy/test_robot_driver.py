@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcdsac_trl.deploy import CameraPose, Policy
+from rcdsac_trl.deploy import CameraPose, InputLimits, Policy
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.errors import UserInputError
@@ -71,7 +71,7 @@ class Recorder:
     """Stands in for a policy, and keeps the waypoints it is given, in the map frame of a robot that looks along x."""
 
     def __init__(self) -> None:
-        self.config = agent().config
+        self.config, self.limits = agent().config, InputLimits()
         self.waypoints: Any = None
 
     def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Any) -> Command:
@@ -172,7 +172,10 @@ def test_a_path_in_another_frame_is_a_new_one_and_a_broken_one_costs_no_progress
     drive.driver.on_path(path(LOOP))
     assert drive.next() == [[4.0, 4.0], [0.0, 4.0]]
     drive.driver.on_path(path(LOOP, "map"))
-    assert drive.next() == "the path is in frame 'map', odometry in 'odom': send both in one"
+    assert drive.next() == (
+        "the path is in frame 'map', odometry in 'odom': no transform names frame 'map': there are none; start the "
+        "localisation, or send both in one frame"
+    )
 
 
 def test_a_straight_way_of_130_m_is_driven() -> None:
@@ -216,7 +219,7 @@ def test_clouds_to_a_driver_without_cameras_are_named() -> None:
 
 
 def test_zeros_are_named_with_their_parameter_which_makes_them_open_space() -> None:
-    for zero_means, told in (("unknown", "360 of 360 rays read 0; if the driver writes 0"), ("nothing", None)):
+    for zero_means, told in (("invalid", "360 of 360 rays read 0; if the driver writes 0"), ("far", None)):
         driver = Driver(Policy(agent()), zero_means=zero_means)  # type: ignore[arg-type]
         driver.on_odometry(odometry(10.0, 0.0, 0.0))
         driver.on_path(path([(5.0, 0.0)]))

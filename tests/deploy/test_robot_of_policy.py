@@ -4,7 +4,6 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,11 +19,12 @@ from rcdsac_trl.deploy import (
     scan_sectors,
     shipped_names,
 )
+from rcdsac_trl.deploy.frames.sensor_mounts import mount_of
 from rcdsac_trl.deploy.policy import guard as guards
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, SHIPPED, packed
 from rcdsac_trl.deploy.sensors.cloud import CameraPose
-from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of
+from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of_lidar
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import LidarSettings
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
@@ -75,7 +75,7 @@ def test_weights_of_before_drive_the_papers_robot(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
     config = json.loads((tmp_path / "config.json").read_bytes())
     assert config.pop("format_version") == FORMAT_VERSION == 4
-    del config["robot"]
+    del config["robot"], config["restart_steps"]
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 3}))
     assert read_weights(tmp_path).config == agent().config
     for name in shipped_names():
@@ -150,10 +150,12 @@ def test_what_touches_a_small_robot_is_no_part_of_it() -> None:
 
 def test_the_driver_knows_where_the_scanner_sits() -> None:
     driver = Driver(full(BURGER))
-    assert driver._mount == mount_of(BURGER.lidar) == Mount(-0.032, 0.0, 0.0)
+    assert mount_of(driver._own_mount) == mount_of_lidar(BURGER.lidar) == Mount(-0.032, 0.0, 0.0)
     assert driver._filter.body_radius_m == BURGER.body_radius_m
-    assert Driver(full(PAPER))._mount == Mount()
-    assert Driver(SimpleNamespace(config=agent(robot=BURGER).config), mount=Mount(0.1))._mount == Mount(0.1)  # type: ignore[arg-type]
+    assert mount_of(Driver(full(PAPER))._own_mount) == Mount()
+    given = Driver(full(BURGER), mount=Mount(0.1))._mount
+    assert given is not None
+    assert mount_of(given) == Mount(0.1)
 
 
 def test_clearance_of_a_robot_that_sees_farther() -> None:

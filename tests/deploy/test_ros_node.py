@@ -9,8 +9,10 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-from test_robot_driver import laser, odometry, path
+from test_frames import tf
+from test_robot_driver import cloud, laser, odometry, path
 
+from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
 from rcdsac_trl.deploy.policy.weights import packed
 from robots import agent
 
@@ -24,6 +26,7 @@ class Node:
     def __init__(self, name: str) -> None:
         self.parameters: dict[str, Any] = {}
         self.subscriptions: dict[str, Any] = {}
+        self.qos: dict[str, Any] = {}
         self.published: list[Any] = []
         self.publishers: dict[str, Any] = {}
         self.timers: list[Any] = []
@@ -41,6 +44,7 @@ class Node:
 
     def create_subscription(self, kind: Any, topic: str, callback: Any, qos: Any) -> None:
         self.subscriptions[topic] = callback
+        self.qos[topic] = qos
 
     def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
         self.publishers[topic] = kind
@@ -89,12 +93,17 @@ def ros_node(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
         "rclpy": {"init": lambda: None, "try_shutdown": lambda: None, "spin": lambda node: node.timers[0]()},
         "rclpy.node": {"Node": Node},
         "rclpy.parameter": {"Parameter": SimpleNamespace},
-        "rclpy.qos": {"qos_profile_sensor_data": 5},
+        "rclpy.qos": {
+            "qos_profile_sensor_data": 5,
+            "QoSProfile": SimpleNamespace,
+            "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL="kept"),
+        },
         "rcl_interfaces.msg": {"SetParametersResult": SimpleNamespace},
-        "geometry_msgs.msg": {"Twist": Twist, "TwistStamped": TwistStamped},
+        "geometry_msgs.msg": {"Twist": Twist, "TwistStamped": TwistStamped, "PoseWithCovarianceStamped": object},
         "nav_msgs.msg": {"Odometry": object, "Path": object},
-        "sensor_msgs.msg": {"LaserScan": object},
-        "std_msgs.msg": {"Float32MultiArray": SimpleNamespace},
+        "sensor_msgs.msg": {"LaserScan": object, "PointCloud2": object},
+        "std_msgs.msg": {"Float32MultiArray": SimpleNamespace, "String": SimpleNamespace},
+        "tf2_msgs.msg": {"TFMessage": object},
     }
     for name, members in contents.items():
         module = ModuleType(name)
@@ -122,7 +131,9 @@ def test_it_drives_and_writes_stamped_or_plain_twists(ros_node: Any) -> None:
     assert stamped_node.publishers["cmd_vel"] is TwistStamped
     assert (stamped.header.stamp.sec, stamped.header.frame_id) == (10, "base_link")
     assert stamped_node.told == []
-    assert len(stamped_node.published) == 2  # and the quantiles
+    _, quantiles, status = stamped_node.published
+    assert len(quantiles.data) == 16
+    assert status.data == "driving"
     Node.given["command_type"] = "Twist"
     node = ros_node.PolicyNode()
     plain = driven(node)
@@ -140,11 +151,43 @@ def test_parameters_are_live_and_zeros_mean_what_is_said(ros_node: Any) -> None:
     node.set([SimpleNamespace(name="beta", value=math.nan), SimpleNamespace(name="stop", value=False)])
     assert node.driver.beta is None
     driven(node, [0.0] * 360)
-    assert "set zero_means='nothing'" in node.told[-1]
-    Node.given["zero_means"] = "nothing"
+    assert "set zero_means=far" in node.told[-1]
+    Node.given["zero_means"] = "far"
     node = ros_node.PolicyNode()
     driven(node, [0.0] * 360)
     assert node.told == []
+
+
+def test_it_reads_transforms_and_says_where_the_sensors_are_that_have_none(ros_node: Any) -> None:
+    node = ros_node.PolicyNode()
+    assert node.qos["/tf_static"].durability == "kept"
+    node.subscriptions["/tf_static"](tf(0.0, "base_link", "laser", RigidTransform.planar(0.2, 0.0, 1.0)))
+    assert driven(node).twist.linear.x != 0.0
+    mount = node.driver.situation.ranges.mount
+    assert (mount.x_m, mount.yaw_rad) == pytest.approx((0.2, 1.0))
+    Node.given |= {"laser_yaw_rad": 0.5, "localisation_timeout_s": 0.3}
+    node = ros_node.PolicyNode()
+    node.subscriptions["/tf"](tf(9.5, "map", "odom", RigidTransform.planar(0.0, 0.0, 0.0)))
+    driven(node)
+    assert node.driver.situation.ranges.mount.yaw_rad == pytest.approx(0.5)
+    node.subscriptions["plan"](path([(5.0, 0.0)], "map"))
+    node.timers[0]()
+    assert "the localisation is lost" in node.published[-1].data
+    assert "the localisation is lost" in node.told[-1]
+
+
+def test_cameras_are_read_in_place_of_the_scanner(ros_node: Any) -> None:
+    Node.given |= {"camera_frames": ["cam"], "camera_topics": ["front/points"], "camera_views_rad": [1.7]}
+    node = ros_node.PolicyNode()
+    node.timers[1]()
+    assert "nobody writes front/points (sensor_msgs/msg/PointCloud2)" in node.told[-1]
+    node.subscriptions["front/points"](cloud(10.0, "cam"))
+    driven(node)
+    assert node.told[-1].startswith("nobody says where the sensor in frame 'cam' sits: no transform names frame")
+    pose = RigidTransform((0.2, 0.0, 0.4))
+    node.subscriptions["/tf_static"](tf(0.0, "base_link", "cam", pose))
+    driven(node)
+    assert node.driver.situation.ranges.distances_m[0] == pytest.approx(1.7, abs=1e-3)
 
 
 def test_it_tells_who_reads_its_commands_whenever_that_changes(ros_node: Any) -> None:
@@ -172,8 +215,13 @@ def test_it_tells_who_reads_its_commands_whenever_that_changes(ros_node: Any) ->
     ("given", "told"),
     [
         ({"command_type": "twist"}, "command_type=twist is not one of TwistStamped, Twist"),
-        ({"zero_means": "open"}, "zero_means='open' is neither"),
+        ({"zero_means": "open"}, "zero_means='open' is none of"),
         ({"laser_x_m": 150.0}, "x_m=150, y_m=0 is more than 1 m from the robot's centre: give metres"),
+        (
+            {"camera_frames": ["a", "b"], "camera_topics": ["a"]},
+            "camera_frames has 2 entries, camera_topics 1, camera_views_rad 1: give one a camera in each",
+        ),
+        ({"localisation": "gps"}, "localisation='gps' is neither 'tf' nor 'pose'"),
         ({"agent": "nobody"}, "there is no agent 'nobody'"),
     ],
 )

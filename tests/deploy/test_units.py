@@ -115,17 +115,15 @@ def test_zeros_are_open_space_only_where_that_is_said() -> None:
     assert scan_sectors(zeros).covered.all()  # half of the rays of a sector are enough
     none = Policy(agent()).act(scan(0.0), AHEAD, STANDING)
     assert none.stopped
-    assert "360 of 360 rays read 0; if the driver writes 0 where nothing is, set zero_means='nothing'" in str(
-        none.reason
-    )
-    found = scan_sectors(scan(0.0, zero_means="nothing"))
+    assert "360 of 360 rays read 0; if the driver writes 0 where nothing is, set zero_means=far" in str(none.reason)
+    found = scan_sectors(scan(0.0, zero_means="far"))
     assert found.covered.all()
     assert np.isinf(found.distances_m).all()
-    assert Policy(agent()).act(scan(0.0, zero_means="nothing"), AHEAD, STANDING).reason is None
-    blind = Policy(agent()).act(scan(math.nan, zero_means="nothing"), AHEAD, STANDING)
+    assert Policy(agent()).act(scan(0.0, zero_means="far"), AHEAD, STANDING).reason is None
+    blind = Policy(agent()).act(scan(math.nan, zero_means="far"), AHEAD, STANDING)
     assert "zero_means" not in str(blind.reason)
-    with pytest.raises(UserInputError, match="zero_means='far' is neither 'unknown' nor 'nothing'"):
-        scan_sectors(scan(2.0, zero_means="far"))
+    with pytest.raises(UserInputError, match="zero_means='open' is none of invalid, far, near"):
+        scan_sectors(scan(2.0, zero_means="open"))
 
 
 # ------------------------------------------------------------------------------------------------ the rest of the input

@@ -35,7 +35,7 @@ def branches():
         split="evaluation",
         seed=0,
         agent_ids=[0] * ROLLOUTS + [1] * ROLLOUTS,
-        memory=settings.network.memory,
+        state_size=settings.network.state_size,
         conditions=[Condition(beta=-1.0)] * (2 * ROLLOUTS),
     )
     rewards, poses = [], []
@@ -92,7 +92,7 @@ def test_every_beta_is_rolled_out_with_the_same_noise() -> None:
         split="evaluation",
         seed=0,
         agent_ids=[0] * ROLLOUTS * 2,
-        memory=settings.network.memory,
+        state_size=settings.network.state_size,
         conditions=[Condition(beta=-1.0)] * (2 * ROLLOUTS),
     )
     with torch.no_grad():

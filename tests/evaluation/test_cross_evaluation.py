@@ -41,7 +41,7 @@ class Watched:
             split="evaluation",
             seed=0,
             agent_ids=[state for state in range(2) for _ in range(ROLLOUTS)] * 2,
-            memory=settings.network.memory,
+            state_size=settings.network.state_size,
             conditions=[Condition(beta=beta) for beta in BETAS for _ in range(2 * ROLLOUTS)],
         )
         self._seen: dict[str, list[torch.Tensor]] = {"action": [], "pose": [], "memory": [], "reward": []}

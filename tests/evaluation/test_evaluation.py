@@ -366,7 +366,7 @@ def test_a_table_of_known_episodes(sampled: bool) -> None:
 
 
 def told_environment(
-    world: WorldSettings, algo: AlgoSettings | None, conditions: list[Condition], agents: int, memory: int
+    world: WorldSettings, algo: AlgoSettings | None, conditions: list[Condition], agents: int, state_size: int
 ) -> EnvBase:
     """Make an evaluation's agents as an environment that transforms tell what they are told."""
     return environment(
@@ -375,7 +375,7 @@ def told_environment(
         split="evaluation",
         seed=0,
         agent_ids=list(range(agents)) * len(conditions),
-        memory=memory,
+        state_size=state_size,
         conditions=[condition for condition in conditions for _ in range(agents)],
     )
 
@@ -385,7 +385,7 @@ def test_the_weighted_row_is_paid_with_its_weight_and_reported_without(tmp_path:
     settings = tiny_settings("rcwr")
     conditions = [Condition(collision_weight=0.5), Condition(collision_weight=2.0)]
     world = crowded(4)
-    env = told_environment(world, settings.algo, conditions, 2, settings.network.memory)
+    env = told_environment(world, settings.algo, conditions, 2, settings.network.state_size)
     tensordict, kept = env.reset(), []
     policy = PursuitPolicy()
     for _ in range(world.task.episode_steps):
@@ -421,7 +421,7 @@ def test_agent_i_of_every_condition_meets_the_same_start(workers: int, monkeypat
     conditions = [Condition(beta=beta) for beta in (-2.0, -1.0, 0.0, -0.5)]
     agents = 3
     world = WorldSettings(settings.map, settings.task, "narrow", num_agents=12, num_workers=workers)
-    env = told_environment(world, settings.algo, conditions, agents, settings.network.memory)
+    env = told_environment(world, settings.algo, conditions, agents, settings.network.state_size)
     starts = []
     for _ in range(2):
         first = env.reset().reshape(-1)
@@ -443,7 +443,7 @@ def test_a_run_meets_the_same_episodes_as_the_baseline(run: Path) -> None:
     world = WorldSettings(settings.map, settings.task, "narrow", num_agents=2, num_workers=0)
     poses = []
     for algo, conditions in ((settings.algo, [Condition(beta=-1.0)]), (None, [Condition()])):
-        env = told_environment(world, algo, conditions, 2, settings.network.memory)
+        env = told_environment(world, algo, conditions, 2, settings.network.state_size)
         poses.append(env.reset()["pose"])
         env.close()
     assert torch.equal(*poses)

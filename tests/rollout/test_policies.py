@@ -158,16 +158,21 @@ def noise_of(number: int) -> AgentNoise:
     return noise
 
 
-@pytest.mark.parametrize(("row", "sensor"), [("rcdsac_pow", "narrow"), ("sac", "sparse"), ("rcwr", "full")])
+@pytest.mark.parametrize(
+    ("row", "sensor", "restart_steps"), [("rcdsac_pow", "narrow", 2), ("sac", "sparse", None), ("rcwr", "full", None)]
+)
 @pytest.mark.parametrize("batch", [(3,), (2, 2)])
-def test_the_lean_policy_is_the_policy_to_rounding(row: str, sensor: str, batch: tuple[int, ...]) -> None:
-    actor = make_loss(tiny_settings(row), "cpu").actor_network
+def test_the_lean_policy_is_the_policy_to_rounding(
+    row: str, sensor: str, restart_steps: int | None, batch: tuple[int, ...]
+) -> None:
+    restarts = f"network.restart_steps={'null' if restart_steps is None else restart_steps}"
+    actor = make_loss(tiny_settings(row, restarts), "cpu").actor_network
     plain = build_policy(actor, Bounded(-1.0, 1.0, (2,)))
     lean = LeanPolicy(actor, noise_of(math.prod(batch)))
     drawn = noise_of(math.prod(batch))
     assert set(lean.in_keys) == set(plain.in_keys)
     assert set(lean.out_keys) == set(plain.out_keys)
-    states = [torch.zeros(*batch, 128)] * 2
+    states = [torch.zeros(*batch, actor[0].module.state_size)] * 2
     for step in range(1000):
         given = seen(batch, step, sensor)
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):

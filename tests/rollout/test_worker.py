@@ -62,7 +62,7 @@ def test_a_worker_drives_as_the_environment_with_its_transforms(
     conditions = CONDITIONS.get(row or "", [Condition()])
     agents = 4 * len(conditions)
     world = WorldSettings(settings.map, settings.task, "narrow", num_agents=agents, num_workers=workers)
-    memory, observed = settings.network.memory, ("range", "velocity")
+    state_size, observed = settings.network.state_size, ("range", "velocity")
 
     def policy() -> TensorDictModuleBase:
         if row is None:
@@ -71,14 +71,14 @@ def test_a_worker_drives_as_the_environment_with_its_transforms(
         noise.begin(0, "test")
         return make_policy(make_loss(settings, "cpu").actor_network, noise, "cpu")
 
-    worker = evaluation_worker(world, algo, conditions, "evaluation", 0, 4, memory)
+    worker = evaluation_worker(world, algo, conditions, "evaluation", 0, 4, state_size)
     env = environment(
         world,
         algo,
         split="evaluation",
         seed=0,
         agent_ids=[0, 1, 2, 3] * len(conditions),
-        memory=memory,
+        state_size=state_size,
         conditions=[condition for condition in conditions for _ in range(4)],
     )
     context = [] if algo is None or algo.context_key is None else [algo.context_key]
@@ -133,6 +133,19 @@ def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pyt
                 assert torch.equal(batch[key], expected[key]), (name, key)
     assert not torch.equal(first[0]["action"], first[1]["action"])
     assert not multiprocessing.active_children()
+
+
+def test_episodes_that_end_early_are_the_beginning_of_whole_ones() -> None:
+    settings = tiny_settings("sac")
+    worker = evaluation_worker(settings.training_world, None, [Condition()], "validation", 0, 2, memory=4)
+    calls = iter(range(100))
+    drive = partial(worker.rollout, PursuitPolicy(), 1, observed=("pose",), happened=("contact",))
+    whole, short = drive(), drive(ended=lambda written: "contact" in written and next(calls) == 6)
+    worker.close()
+    assert whole.tensordict().shape == (2, STEPS)
+    assert short.tensordict().shape == (2, 7)
+    for key in ("action", "pose", ("next", "pose"), ("next", "contact")):
+        assert torch.equal(short.tensordict()[key], whole.tensordict()[key][:, :7])
 
 
 def test_episodes_are_views_of_what_was_seen() -> None:

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.storage.replay import RANGE_HIGH, RANGE_LOW, RangeCodec, SequenceReplay, bytes_per_slot
+from rcdsac_trl.storage.sequence_replay import RANGE_HIGH, RANGE_LOW, RangeCodec, SequenceReplay, bytes_per_slot
 
 EPISODE_STEPS = 20
 FULL = torch.ones(180, dtype=torch.bool)

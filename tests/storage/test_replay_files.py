@@ -6,8 +6,8 @@ import pytest
 import torch
 from test_replay import EPISODE_STEPS, make_replay, numbered_episodes
 
-from rcdsac_trl.storage.replay import SequenceReplay, bytes_per_slot
 from rcdsac_trl.storage.replay_files import ReplayFiles, remove_others
+from rcdsac_trl.storage.sequence_replay import SequenceReplay, bytes_per_slot
 
 SLOTS = EPISODE_STEPS + 1
 

@@ -12,7 +12,7 @@ from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS, SENSORS, sensor
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import MapSettings, generate_map
 from rcdsac_trl.world.maps.planner import Planner
-from rcdsac_trl.world.sim.lidar import sector_distances
+from rcdsac_trl.world.sim.lidar import NearSegments, sector_distances
 from rcdsac_trl.world.sim.simulation import Simulation
 
 NO_SEGMENTS = np.empty((0, 4))
@@ -240,3 +240,20 @@ def test_dense_rays_converge_to_the_exact_minimum():
     assert dense.mean() < 0.3 * sparse.mean()
     assert dense.mean() < 2e-3
     assert np.quantile(dense, 0.99) < 0.03
+
+
+def test_the_near_segments_of_a_place_give_the_scan_of_all_of_them_bit_for_bit() -> None:
+    map_ = generate_map(MapSettings(size_m=30.0), "train", seed=0, index=2)
+    segments, circles = map_.segments(), map_.circles()
+    index = NearSegments(segments)
+    rng = stream(0, "places")
+    for x, y, yaw in rng.uniform((-1.0, -1.0, -math.pi), (31.0, 31.0, math.pi), (300, 3)):
+        near = index.near(x, y)
+        np.testing.assert_array_equal(
+            sector_distances(x, y, yaw, near, circles), sector_distances(x, y, yaw, segments, circles)
+        )
+        assert len(near) < 0.7 * len(segments)
+    # A segment that begins exactly at the range is out of it; a hair nearer it is not, from the square's far corner.
+    wall = np.array([[5.0, 0.0, 5.0, 1.0]])
+    assert len(NearSegments(wall).near(1.99, 0.5)) == 1
+    assert len(NearSegments(wall).near(-0.01, 0.5)) == 0

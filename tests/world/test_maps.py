@@ -18,6 +18,8 @@ from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.maps.contact_sheet import contact_sheet
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings, file_map
+from rcdsac_trl.world.maps.files.map_files import map_files
 from rcdsac_trl.world.maps.generator import LAYOUTS, SPLITS, Box, Cylinder, Map, MapSettings, Mover, generate_map
 from rcdsac_trl.world.maps.geometry import CELL_M, ROBOT_RADIUS_M, lower_clearance, segment_clearance
 from rcdsac_trl.world.maps.grid_search import keeps_connected, label_components
@@ -335,7 +337,8 @@ def test_mixed_is_the_default_and_static_differs_in_movers_only() -> None:
 
 
 def test_contact_sheet_draws_every_map() -> None:
-    figure = contact_sheet(MapSettings(), "validation", seed=1, count=5)
+    maps = [generate_map(MapSettings(), "validation", seed=1, index=index) for index in range(5)]
+    figure = contact_sheet(maps, "validation", seed=1)
     assert len(figure.axes) == 5
     for index, axes in enumerate(figure.axes):
         map_ = generate_map(MapSettings(), "validation", 1, index)
@@ -355,6 +358,26 @@ def test_draw_maps_writes_the_picture_and_nothing_else(
     assert [path.name for path in tmp_path.iterdir()] == ["maps.png"]
     with Image.open(tmp_path / "maps.png") as image:
         assert min(image.size) > 300
+
+
+def test_draw_maps_writes_maps_that_can_be_read_and_says_what_files_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else it starts this process again
+    monkeypatch.setattr(sys, "argv", ["draw_maps", "count=2", "map=easy", "json=drawn"])
+    draw_maps.main()
+    settings = FileMapSettings(path="drawn")
+    assert [path.name for path in map_files("drawn")] == ["train-0.json", "train-1.json"]
+    assert file_map(settings, "train", 0, 1) == generate_map(MapSettings(**conf("easy")), "train", 0, 1)
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", ["draw_maps", "count=1", "map=file", "map.path=drawn", "out=again.png"])
+    draw_maps.main()
+    told = capsys.readouterr().out.splitlines()
+    assert re.match(
+        r"drawn/train-0\.json: a square of 20\.0 m with \d+ boxes and \d+ cylinders; .* m², 100\.0 % ", told[0]
+    )
+    assert told[1:] == ["drew 1 maps: again.png"]
 
 
 @pytest.mark.parametrize(

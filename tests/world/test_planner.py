@@ -18,7 +18,7 @@ from rcdsac_trl.world.maps.geometry import (
     pull_tight,
     segment_clearance,
 )
-from rcdsac_trl.world.maps.grid_search import cheapest_path, nearest_cell
+from rcdsac_trl.world.maps.grid_search import cheapest_path, farthest_cell, nearest_cell
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.maps.shapes import solid_arrays
 
@@ -158,6 +158,19 @@ def test_the_heap_grows_when_it_must() -> None:
     assert (steps * mean).sum() == pytest.approx(expected)
 
 
+def test_farthest_cell_is_the_end_of_the_longest_way() -> None:
+    free = np.ones((7, 5), bool)
+    free[2, :4] = free[4, 1:] = False  # a way that winds: right, left, right
+    assert farthest_cell(free, 0) == (6 * 5 + 4, pytest.approx(3 * (2 + 2 * math.sqrt(2))))
+    rng = stream(0, "test")
+    free = rng.random((30, 40)) < 0.7
+    start = int(np.flatnonzero(free)[0])
+    costs = MCP_Geometric(np.where(free, 1.0, -1.0)).find_costs([divmod(start, 40)])[0].ravel()
+    reached = np.where(np.isfinite(costs), costs, -1.0)
+    cell, length = farthest_cell(free, start)
+    assert (length, reached[cell]) == pytest.approx((reached.max(), reached.max()))
+
+
 def test_nearest_cell_by_hand() -> None:
     free = np.zeros((3, 3), bool)
     assert nearest_cell(free, 0.0, 0.0, 0.1) == -1
@@ -192,12 +205,36 @@ def test_a_leg_is_clear_where_its_clearance_is_enough() -> None:
     assert found == {(-1e-9, True), (0.3, True), (0.3, False)}
 
 
+def test_what_the_field_shows_of_a_leg_is_true_and_changes_no_path() -> None:
+    layer = Planner(generate_map(MapSettings(), "train", seed=0, index=1))._true
+    extents = geometry._bounding_boxes(layer.boxes)
+    rng = stream(0, "legs")
+    blocked = unseen = 0
+    for ax, ay, length_m, angle in rng.uniform((0, 0, 0, 0), (20, 20, 4, 7), (3000, 4)):
+        leg = ax, ay, ax + length_m * np.cos(angle), ay + length_m * np.sin(angle)
+        clear = geometry._is_clear(*leg, layer.boxes, extents, layer.circles, layer.leg_m)
+        shown = geometry._surely_blocked(*leg, layer.field, layer.leg_m, CELL_M)
+        assert not (shown and clear)
+        blocked += shown
+        unseen += not shown and not clear
+    assert blocked > 4 * unseen > 0
+    known_nothing = np.full_like(layer.field, np.inf)
+    for _ in range(20):
+        start, goal = layer.sample(rng), layer.sample(rng)
+        cells = layer.centre(layer.cells_between(layer.nearest(start), layer.nearest(goal)))
+        pulled = [
+            pull_tight(cells, layer.boxes, layer.circles, field, layer.weight, layer.leg_m, layer.leg_m, CELL_M)
+            for field in (layer.field, known_nothing)
+        ]
+        np.testing.assert_array_equal(*pulled)
+
+
 def test_pull_tight_leaves_only_the_corner() -> None:
     boxes, circles = solid_arrays([Box(0.0, 0.0, 1.0, 1.0, 0.0, mapped=True)])
     legs = [(x, 1.5) for x in np.linspace(-2, 1.5, 36)] + [(1.5, y) for y in np.linspace(1.4, -2, 35)]
     path = np.array([*legs]) + 3.0
     boxes[:, :2] += 3.0
-    corners = pull_tight(path, boxes, circles, np.ones((60, 60)), 0.3, 0.3, CELL_M)
+    corners = pull_tight(path, boxes, circles, np.full((60, 60), np.inf), np.ones((60, 60)), 0.3, 0.3, CELL_M)
     assert corners[-1] == len(path) - 1
     assert len(corners) <= 3
     points = np.vstack([path[:1], path[corners]])

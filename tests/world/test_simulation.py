@@ -15,6 +15,7 @@ from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import Box, Cylinder, Map, MapSettings, Mover, generate_map
 from rcdsac_trl.world.maps.planner import Planner
+from rcdsac_trl.world.sim import bodies
 from rcdsac_trl.world.sim import simulation as world_simulation
 from rcdsac_trl.world.sim.lidar import sector_distances
 from rcdsac_trl.world.sim.simulation import Simulation
@@ -431,3 +432,36 @@ def test_what_is_not_asked_and_not_repeated_changes_nothing(simulation, monkeypa
     assert short == long
     contacts = sum(result.in_contact for result, _, _ in short)
     assert 0 < contacts < 400, "both ways were taken"
+
+
+def test_of_a_large_map_only_what_is_near_exists_and_nothing_else_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    map_ = generate_map(MapSettings(size_m=40.0, clutter_per_m2=0.5, num_movers=3), "train", seed=0, index=4)
+    # As in maps of files: neighbours follow each other, and become one body.
+    map_ = replace(map_, boxes=tuple(sorted(map_.boxes, key=lambda box: (box.y // 4.0, box.x // 4.0))))
+    planner = Planner(map_)
+    assert len(map_.boxes) + len(map_.cylinders) > 300
+    rng = stream(0, "bumping")
+    starts = [planner.sample_free(rng).tolist() for _ in range(6)]
+    commands = rng.uniform((0.2, -0.6), (0.6, 0.6), (150, 2))
+
+    def driven(most_whole: int) -> tuple[list[tuple], int, list[int]]:
+        monkeypatch.setattr(bodies, "MAX_WHOLE_SHAPES", most_whole)
+        simulation, contacts = Simulation(), 0
+        found: list[tuple] = []
+        existing: list[int] = []
+        for x, y in starts:
+            simulation.load(map_, planner, (x, y, 1.0), stream(0, "movers"))
+            for v, omega in commands:
+                result = simulation.step(float(v), float(omega), 7)
+                found.append((*result, *simulation.scan().tolist()))
+                contacts += result.in_contact
+                existing.append(pybullet.getNumBodies(simulation._client))
+        simulation.close()
+        return found, contacts, existing
+
+    whole, contacts, all_bodies = driven(10_000)
+    near, _, few_bodies = driven(10)
+    assert contacts > 50
+    assert near == whole
+    assert max(few_bodies) < 0.7 * min(all_bodies)
+    assert len(set(few_bodies)) > 3  # they came and went

@@ -154,7 +154,7 @@ def build_policy(
     )
 
 
-def recurrent_state_primer(memory_size: int = NetworkSettings.memory) -> TensorDictPrimer:
-    """Return the transform that puts a zero ``recurrent_state`` ``[*, memory_size]`` into every reset."""
-    state = Unbounded((memory_size,), device="cpu", dtype=torch.float32)
+def recurrent_state_primer(state_size: int = NetworkSettings.memory) -> TensorDictPrimer:
+    """Return the transform that puts a zero ``recurrent_state`` ``[*, state_size]`` into every reset."""
+    state = Unbounded((state_size,), device="cpu", dtype=torch.float32)
     return TensorDictPrimer({STATE_KEY: state}, default_value=0.0, expand_specs=True)

@@ -23,9 +23,11 @@ class NetworkSettings:
         range_code: how they read a bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
         encoder: an encoder of yours as ``package.module.Class``; see
             :class:`~rcdsac_trl.agent.networks.HistoryEncoder`. None for :class:`~rcdsac_trl.agent.networks.Encoder`.
+        restart_steps: our encoder's recurrent state restarts every so many observations, while the one before is read;
+            see :class:`~rcdsac_trl.agent.networks.Encoder`. None: it never does.
 
     Raises:
-        UserInputError: if a width is below 1, or there is no such padding, code or encoder.
+        UserInputError: if a width or ``restart_steps`` is below 1, or there is no such padding, code or encoder.
     """
 
     conv: int = 32
@@ -37,12 +39,17 @@ class NetworkSettings:
     padding: Padding = "circular"
     range_code: RangeCode = "paper"
     encoder: str | None = None
+    restart_steps: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse widths below 1, other readings of the bins, and an encoder that cannot be imported."""
         for name, width in self.widths.items():
             if width < 1:
                 raise UserInputError(f"network width {name} = {width} is below 1: give a positive integer")
+        if self.restart_steps is not None and self.restart_steps < 1:
+            raise UserInputError(
+                f"network.restart_steps={self.restart_steps} is below 1: give a number of steps or null"
+            )
         one_of("network.padding", self.padding, Padding)
         one_of("network.range_code", self.range_code, RangeCode)
         if self.encoder is not None:
@@ -53,4 +60,10 @@ class NetworkSettings:
     @property
     def widths(self) -> dict[str, int]:
         """The sizes of the layers, by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, int)}
+        return {name: value for name, value in vars(self).items() if isinstance(value, int) and name != "restart_steps"}
+
+    @property
+    def state_size(self) -> int:
+        """How many numbers an encoder carries from step to step."""
+        restarts = self.encoder is None and self.restart_steps is not None
+        return 2 * self.memory + 1 if restarts else self.memory

@@ -13,7 +13,7 @@ place where it knows the module.
 
 import importlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -80,12 +80,12 @@ class HistoryEncoder(nn.Module):
 
     Attributes:
         memory_size: how many numbers the heads read.
-        state_size: how many numbers it carries from step to step: ``network.memory``.
+        state_size: how many numbers it carries from step to step: ``network.state_size``, of yours ``network.memory``.
     """
 
     def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
         super().__init__()
-        self.memory_size, self.state_size = self.memory_size_of(network), network.memory
+        self.memory_size, self.state_size = self.memory_size_of(network), network.state_size
 
     @classmethod
     def memory_size_of(cls, network: NetworkSettings) -> int:
@@ -114,6 +114,12 @@ class HistoryEncoder(nn.Module):
 class Encoder(HistoryEncoder):
     """Observation history to memory: per-input features, concatenated, into a GRU. Its state is its memory.
 
+    With ``network.restart_steps`` R it looks back as far as training unrolls it, no matter how long an episode is: a
+    state that has run for hundreds of steps is none that was trained. Two states take turns. Every R observations the
+    older one is dropped and a new one begins at zero; the older of the two is the memory. So it has read R + 1 to 2 R
+    observations, all of them at an episode's start. What is carried is both, the older first, and how many observations
+    the younger has read.
+
     Args:
         vectors: as for :class:`HistoryEncoder`; each gets its own linear layer.
         network: sizes of the layers.
@@ -130,10 +136,14 @@ class Encoder(HistoryEncoder):
         self.range = RangeFeatures(network.conv, network.range, network.padding, network.range_code)
         self.vectors = nn.ModuleList(nn.Linear(size, network.vector) for size in vectors.values())
         self.gru = nn.GRU(network.range + network.vector * len(vectors), network.memory, batch_first=True)
+        self.restart_steps = network.restart_steps
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
-        """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``."""
-        return self.gru(self.features(range_, vectors))[0]
+        """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``.
+
+        A sequence of up to 2 R + 1 observations, as training unrolls, is read as a whole.
+        """
+        return in_turn(lambda features: self.gru(features)[0], self.features(range_, vectors), self.restart_steps)
 
     def step(self, range_: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
         """Advance any batch ``[*]`` of agents by one observation; see :meth:`HistoryEncoder.step`."""
@@ -142,10 +152,20 @@ class Encoder(HistoryEncoder):
 
     def advance(self, features: Tensor, is_init: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Do the recurrent part of :meth:`step`, from the features ``[*, n]`` of an observation."""
-        lead = features.shape[:-1]
-        state = torch.where(is_init, torch.zeros_like(state), state).reshape(1, -1, self.memory_size)
-        state = self.gru(features.reshape(-1, 1, features.shape[-1]), state)[1].reshape(*lead, self.memory_size)
-        return state, state
+        state = torch.where(is_init, torch.zeros_like(state), state)
+        if self.restart_steps is None:
+            state = self._read(features, state)
+            return state, state
+        older, younger, age = state.split((self.memory_size, self.memory_size, 1), dim=-1)
+        is_due = age >= self.restart_steps
+        older, younger = torch.where(is_due, younger, older), torch.where(is_due, 0.0, younger)
+        older, younger = self._read(torch.stack((features, features)), torch.stack((older, younger)))
+        return older, torch.cat((older, younger, torch.where(is_due, 0.0, age) + 1.0), dim=-1)
+
+    def _read(self, features: Tensor, state: Tensor) -> Tensor:
+        """Return the states ``[*, memory]`` after one observation each."""
+        rows, states = features.reshape(-1, 1, features.shape[-1]), state.reshape(1, -1, self.memory_size)
+        return self.gru(rows, states)[1].view(state.shape)
 
     def features(self, range_: Tensor, vectors: Sequence[Tensor]) -> Tensor:
         """Return the rectified features of observations ``[*, ..]``, those of the bins first, ``[*, n]``."""
@@ -153,6 +173,26 @@ class Encoder(HistoryEncoder):
         parts = [self.range(range_.reshape(-1, NUM_BINS)).reshape(*lead, -1)]
         parts += [F.relu(layer(value)) for layer, value in zip(self.vectors, vectors, strict=True)]
         return torch.cat(parts, dim=-1)
+
+
+def in_turn(run: Callable[[Tensor], Tensor], features: Tensor, restart_steps: int | None) -> Tensor:
+    """Run a recurrent layer over whole sequences with restarts; see :class:`Encoder`.
+
+    Args:
+        run: the layer from a zero state, ``[B, t, n]`` to ``[B, t, memory]``.
+        features: ``[B, T, n]``.
+        restart_steps: R, or None.
+
+    Returns:
+        ``[B, T, memory]``.
+    """
+    steps = features.shape[1]
+    if restart_steps is None or steps <= 2 * restart_steps + 1:
+        return run(features)
+    starts = range(restart_steps, steps - restart_steps, restart_steps)
+    first = run(features[:, : 2 * restart_steps])
+    later = [run(features[:, start : start + 2 * restart_steps])[:, restart_steps:] for start in starts]
+    return torch.cat([first, *later], dim=1)
 
 
 def encoder_class(network: NetworkSettings) -> type[HistoryEncoder]:

@@ -1,24 +1,28 @@
 """What an evaluation, a calibration, an export or a publication may choose: the roots of their files in ``conf/``."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, TypeVar
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
-from rcdsac_trl.config.typed import read
+from rcdsac_trl.config.typed import read, section_class
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.processes import resolve_processes
+from rcdsac_trl.world.maps.files.barn import GOAL_RADIUS_M, TIME_LIMIT_S, BarnMapSettings
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.task.rules import TaskSettings
 
 Name = Literal["best", "last"] | int
 """How users name a checkpoint; a number: by the iterations that were done."""
 
 
-Section = TypeVar("Section", MapSettings, SensorSettings, TaskSettings, RobotSettings)
+Section = TypeVar("Section", SensorSettings, TaskSettings, RobotSettings)
 
 _MOST_FPS = 120
 
@@ -74,6 +78,22 @@ class ExportSettings:
         if self.run is None:
             raise UserInputError("name what to export: run=<folder>, or a shipped agent")
         check_least("num_quantiles", self.num_quantiles, 1)
+
+
+class ChosenWorld(NamedTuple):
+    """Where an evaluation drives.
+
+    Attributes:
+        maps: what maps are made from.
+        sensor: what the agents see.
+        task: what they are to do.
+        barn: the worlds of BARN's protocol, where that is driven; maps and task then follow from it.
+    """
+
+    maps: MapSource
+    sensor: SensorSettings
+    task: TaskSettings
+    barn: BarnMapSettings | None = None
 
 
 @dataclass(frozen=True)
@@ -133,17 +153,18 @@ class EvaluationSettings:
         runtime.check_device_name(self.device)
         runtime.resolve_threads(self.threads)
 
-    def world_of(self, trained: TrainingSettings) -> tuple[MapSettings, SensorSettings, TaskSettings]:
+    def world_of(self, trained: TrainingSettings) -> ChosenWorld:
         """Return map set, sensor and task: those of a training, with what was chosen in their place.
 
         Raises:
-            UserInputError: for a key or a value that they do not have.
+            UserInputError: for a key or a value that they do not have, and worlds of BARN that are not there.
         """
-        return (
-            _changed(trained.map, self.map, "map"),
-            _changed(trained.sensor, self.sensor, "sensor"),
-            _changed(trained.task, self.task, "task"),
-        )
+        maps = _changed_maps(trained.map, self.map)
+        sensor, task = _changed(trained.sensor, self.sensor, "sensor"), _changed(trained.task, self.task, "task")
+        if not isinstance(maps, BarnMapSettings):
+            return ChosenWorld(maps, sensor, task)
+        steps = math.ceil(TIME_LIMIT_S / (min(task.motor_steps) * self.robot_of(trained).motor_period_s))
+        return ChosenWorld(maps.files(), sensor, replace(task, goal_radius_m=GOAL_RADIUS_M, episode_steps=steps), maps)
 
     def robot_of(self, trained: TrainingSettings) -> RobotSettings:
         """Return the robot: that of a training, or for a baseline the one that was chosen.
@@ -158,6 +179,17 @@ class EvaluationSettings:
                 "it was then, leave robot out"
             )
         return robot
+
+
+def _changed_maps(trained: MapSource, values: Mapping[str, Any] | None) -> MapSource | BarnMapSettings:
+    if not values:
+        return trained
+    chosen = section_class((type(trained), MapSettings, FileMapSettings, BarnMapSettings), values)
+    if chosen is not type(trained):  # a training's keys say nothing of maps of another kind
+        return read(chosen, values, "map")
+    if "path" in values:  # of other files nothing was noted
+        values = {"sha256": None, **values}
+    return read(chosen, {**vars(trained), **values}, "map")
 
 
 def _changed(section: Section, values: Mapping[str, Any] | None, name: str) -> Section:

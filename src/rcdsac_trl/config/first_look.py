@@ -16,9 +16,12 @@ from rcdsac_trl.config.evaluation_settings import (
     PublishSettings,
 )
 from rcdsac_trl.config.named_folder import default_training, find_agent
+from rcdsac_trl.config.replay_settings import ReplaySettings
 from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.deploy import find_weights
+from rcdsac_trl.deploy.recordings.open_recording import open_recording
 from rcdsac_trl.system.resources import check_out, check_writable
+from rcdsac_trl.world.maps.map_source import check_maps
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 
@@ -32,8 +35,10 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     trained = default_training() if settings.run is None else find_agent(settings.run).settings()
     if settings.run is not None:
         trained.algo.conditions(settings.beta, settings.collision_weight)
-    maps, sensor, task = settings.world_of(trained)
-    WorldSettings(maps, task, sensor.name, sensor.memory_s, robot=settings.robot_of(trained))
+    chosen = settings.world_of(trained)
+    robot = settings.robot_of(trained)
+    WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=robot)
+    check_maps(chosen.maps, chosen.task.min_path_m, robot.circumradius_m)
     _look_at_out(settings.out)
 
 
@@ -45,7 +50,8 @@ def look_at_calibration(cfg: DictConfig) -> None:
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is not None:
-        find_agent(settings.run).settings()
+        trained = find_agent(settings.run).settings()
+        check_maps(trained.map, trained.task.min_path_m, trained.robot.circumradius_m)
     _look_at_out(settings.out)
 
 
@@ -85,6 +91,19 @@ def look_at_publication(cfg: DictConfig) -> None:
         agent_of_run(Path(run))
     for folder in (settings.weights, settings.results):
         check_writable(Path(folder))
+
+
+def look_at_replay(cfg: DictConfig) -> None:
+    """Refuse settings, an agent and a recording that `replay` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, ReplaySettings)
+    find_agent(settings.run)
+    assert settings.recording is not None
+    open_recording(Path(settings.recording))
+    _look_at_out(settings.out)
 
 
 def _look_at_out(out: str | None) -> None:

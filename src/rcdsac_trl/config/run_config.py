@@ -17,6 +17,8 @@ from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings
+from rcdsac_trl.world.maps.map_source import check_maps, with_digests
 from rcdsac_trl.world.task.rules import TaskSettings
 
 CONFIG_NAME = "config.yaml"
@@ -56,13 +58,32 @@ def settings_of_new_run(cfg: DictConfig) -> TrainingSettings:
     settings = training_settings(cfg)
     settings.logger.check_backends()
     settings.collector.check_package()
+    check_maps(settings.map, settings.task.min_path_m, settings.robot.circumradius_m)
     return settings
+
+
+def with_map_digests(cfg: DictConfig) -> DictConfig:
+    """Return the config of a training with a note of what its map files are, so that nobody goes on with others.
+
+    Raises:
+        UserInputError: as :func:`training_settings`, or a file cannot be read.
+    """
+    noted = with_digests(training_settings(cfg).map)
+    if not isinstance(noted, FileMapSettings):
+        return cfg
+    cfg = cfg.copy()
+    OmegaConf.update(cfg, "map.sha256", list(noted.sha256 or ()))
+    return cfg
 
 
 def _training_settings(values: dict[str, Any]) -> TrainingSettings:
     algo = values.get("algo")
     if algo is None or (isinstance(algo, dict) and "name" not in algo):  # +algo.beta=-1 alone makes a section
         raise UserInputError(f"no algorithm chosen: add +algo=<name>, one of {', '.join(choices('algo'))}")
+    if "protocol" in (values.get("map") or {}):
+        raise UserInputError(
+            "map=barn is a test, which `evaluate` drives: train on other worlds, map=file map.path=<their folder>"
+        )
     return read(TrainingSettings, values)
 
 

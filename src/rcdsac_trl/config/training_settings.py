@@ -16,7 +16,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
-from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.task.rules import TaskSettings
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
@@ -116,7 +116,7 @@ class TrainingSettings:
 
     algo: AlgoSettings
     sensor: SensorSettings
-    map: MapSettings
+    map: MapSource
     task: TaskSettings
     logger: LoggerSettings
     resume: str | None
@@ -152,6 +152,12 @@ class TrainingSettings:
             raise UserInputError(
                 f"learner.sequence_length={sequence_length} is longer than an episode of "
                 f"task.episode_steps={episode_steps} transitions: shorten it"
+            )
+        restart_steps, unrolled = self.network.restart_steps, sequence_length + 1
+        if restart_steps is not None and 2 * restart_steps > unrolled:
+            raise UserInputError(
+                f"network.restart_steps={restart_steps} lets agents look back {2 * restart_steps} observations, and "
+                f"learner.sequence_length={sequence_length} unrolls {unrolled}: give at most {unrolled // 2}, or null"
             )
         iteration_steps = self.training_world.num_agents * episode_steps
         if self.replay.capacity_steps < iteration_steps:

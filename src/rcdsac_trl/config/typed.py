@@ -2,7 +2,7 @@
 
 import difflib
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -53,6 +53,29 @@ def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> S
     return cls(**{key: _fit(value, hints[key], _join(section, key)) for key, value in values.items()})
 
 
+def section_class(classes: Sequence[type[Settings]], values: Mapping[str, Any]) -> type[Settings]:
+    """Choose the class that a section is of: the first that has all its keys and needs no other, else the nearest.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Lens:
+        ...     focus_m: float
+        >>> @dataclass
+        ... class Mirror:
+        ...     radius_m: float
+        >>> section_class([Lens, Mirror], {"radius_m": 2.0}).__name__
+        'Mirror'
+    """
+
+    def misfits(cls: type[Settings]) -> int:
+        known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
+        missing = [name for name, field in known.items() if name not in values and _is_required(field)]
+        return len(missing) + sum(key not in known for key in values)
+
+    return min(classes, key=misfits)
+
+
 def unknown_key(key: str, known: Iterable[str]) -> str:
     """Say that a key does not exist, and which one may have been meant, else which ones its section has.
 
@@ -91,11 +114,13 @@ def _is_required(field: Field) -> bool:
 
 def _fit(value: Any, hint: Any, path: str) -> Any:
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    sections = [option for option in options if is_dataclass(option) and isinstance(option, type)]
+    if sections and isinstance(value, Mapping):
+        return read(section_class(sections, value), value, path)
     for option in options:
-        if is_dataclass(option) and isinstance(option, type):
-            if isinstance(value, Mapping):
-                return read(option, value, path)
-        elif get_origin(option) is Mapping:
+        if option in sections:
+            continue
+        if get_origin(option) is Mapping:
             if isinstance(value, Mapping):
                 if get_args(option)[1] is Any:
                     return dict(value)

@@ -1,7 +1,8 @@
 """Drive a robot over DDS, without ROS: ``python -m rcdsac_trl.deploy.dds_node <name or folder>``.
 
-For robots whose ROS 2 runs on CycloneDDS. It reads ``scan``, ``odom`` and ``plan``, and writes ``cmd_vel``
-(as ``geometry_msgs/TwistStamped`` and as ``geometry_msgs/Twist``) and the return's quantiles on ``return_quantiles``.
+For robots whose ROS 2 runs on CycloneDDS. It reads ``scan`` (or clouds), ``odom``, ``plan``, ``tf`` and ``tf_static``,
+and writes ``cmd_vel`` (as ``geometry_msgs/TwistStamped`` and as ``geometry_msgs/Twist``), the return's quantiles on
+``return_quantiles``, and on ``drive_status`` why the robot does not go as the agent would.
 ``beta`` (``std_msgs/Float64``) and ``stop`` (``std_msgs/Bool``) are topics, and may be sent while it runs. It needs
 ``cyclonedds``, an extra: ``pip install 'rcdsac-trl[dds]'``.
 """
@@ -12,13 +13,16 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Iterator
 from types import FrameType
 from typing import TYPE_CHECKING, get_args
 
 import rcdsac_trl
+from rcdsac_trl.deploy.frames.robot_frames import FrameSettings, Localisation
 from rcdsac_trl.deploy.policy.driver import Driver
-from rcdsac_trl.deploy.sensors.scan import ZeroMeans
-from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of
+from rcdsac_trl.deploy.ros.topics import without_numbers
+from rcdsac_trl.deploy.sensors.scan import Meaning
+from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
 
 if TYPE_CHECKING:
@@ -26,6 +30,8 @@ if TYPE_CHECKING:
 
 # Every so many commands, about 2 s, it looks who is at the other end of the topics.
 _REPORT_EVERY = 15
+# So often it looks for the simulated clock, s.
+_LOOK_S = 0.002
 _LARGEST_DOMAIN = 232  # the ports of larger ones are beyond the last
 
 
@@ -56,14 +62,18 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
 
     domain_id = _domain_id(os.environ.get("ROS_DOMAIN_ID") or "0")
     remapped = dict(_renaming(text) for text in args.remap)
-    policy = rcdsac_trl.load(args.agent)
-    own = mount_of(policy.robot.lidar)
-    x_m, y_m, yaw_rad = args.laser or (own.x_m, own.y_m, own.yaw_rad)
-    mount = Mount(x_m, y_m, yaw_rad, args.laser_upside_down)
-    driver = Driver(policy, mount=mount, zero_means=args.zero_means)
+    driver = Driver(
+        rcdsac_trl.load(args.agent),
+        mount=_mount(args),
+        cameras={frame: _view_rad(frame, view) for frame, _, view in args.camera},
+        zero_means=args.zero_means,
+        nan_means=args.nan_means,
+        frames=FrameSettings(args.localisation, args.localisation_timeout, args.base_frame),
+    )
     driver.policy.check_beta(args.beta)
     driver.beta = args.beta
-    return DdsBridge(driver, domain_id, remapped=remapped)
+    clouds = [topic for _, topic, _ in args.camera]
+    return DdsBridge(driver, domain_id, remapped=remapped, clouds=clouds, simulated=args.use_sim_time)
 
 
 def drive(bridge: "DdsBridge") -> None:
@@ -72,7 +82,7 @@ def drive(bridge: "DdsBridge") -> None:
     Who reads the commands, and which topics nobody writes, is told as well, whenever it changes.
 
     Args:
-        bridge: that drives; its clock is that of this computer.
+        bridge: that drives; its clock is that of this computer, or the simulated one.
     """
     leaving = False
 
@@ -84,21 +94,49 @@ def drive(bridge: "DdsBridge") -> None:
         signal.signal(number, leave)
     _tell(f"topics: {', '.join(f'/{topic}' for topic in bridge.topics.values())}; Ctrl-C ends it")
     period_s = sum(bridge.driver.policy.config.period_s) / 2.0
-    due_s = time.monotonic()
     said: str | None = None
     reported, steps = "", 0
-    while not leaving:
+    now_s = 0.0
+    for at_s in _simulated_ticks(bridge, period_s) if bridge.simulated else _ticks(period_s):
+        if leaving:
+            break
         steps += 1
         if steps % _REPORT_EVERY == 0 and (report := bridge.report()) != reported:
             _tell(report)
             reported = report
-        command = bridge.step(time.time())
-        if command.reason not in (said, None):
+        if at_s is None:
+            continue
+        now_s = at_s
+        command = bridge.step(now_s)
+        kind = without_numbers(command.reason)
+        if kind not in (said, None):
             _tell(str(command.reason))
-        said = command.reason
-        due_s = max(due_s + period_s, time.monotonic())  # what was missed is not made up for
+        said = kind
+    bridge.leave(now_s if bridge.simulated else time.time())
+
+
+def _ticks(period_s: float) -> Iterator[float]:
+    """Yield the time once in every period; what was missed is not made up for."""
+    due_s = time.monotonic()
+    while True:
+        yield time.time()
+        due_s = max(due_s + period_s, time.monotonic())
         time.sleep(max(due_s - time.monotonic(), 0.0))
-    bridge.leave(time.time())
+
+
+def _simulated_ticks(bridge: "DdsBridge", period_s: float) -> Iterator[float | None]:
+    """Yield the simulated time once in every simulated period, and None where that takes as long by the wall."""
+    last_s: float | None = None
+    shortest_s = period_s - 1e-6  # differences of float seconds are a little less than what they should be
+    while True:
+        give_up_s = time.monotonic() + period_s
+        while (now_s := bridge.simulated_s()) is None or (last_s is not None and 0.0 <= now_s - last_s < shortest_s):
+            if time.monotonic() > give_up_s:
+                now_s = None
+                break
+            time.sleep(_LOOK_S)
+        last_s = last_s if now_s is None else now_s
+        yield now_s
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -114,15 +152,39 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         nargs=3,
         metavar=("X_M", "Y_M", "YAW_RAD"),
-        help="where the scanner sits, from the robot's centre; without it: where the agent's robot has it",
+        help="where the scanner sits, from the robot's centre; else as /tf says, or where the agent's robot has it",
     )
     parser.add_argument("--laser-upside-down", action="store_true", help="the scanner hangs")
+    for reading in ("0", "NaN"):
+        parser.add_argument(
+            f"--{'zero' if reading == '0' else 'nan'}-means",
+            choices=get_args(Meaning),
+            default="invalid",
+            help=f"what the scanner's driver means by a reading of {reading}",
+        )
     parser.add_argument(
-        "--zero-means",
-        choices=get_args(ZeroMeans),
-        default="unknown",
-        help="what the scanner's driver means by a reading of 0",
+        "--camera",
+        action="append",
+        nargs=3,
+        default=[],
+        metavar=("FRAME", "TOPIC", "VIEW_RAD"),
+        help="read clouds in this frame, whose place /tf knows, instead of scans; may be given several times",
     )
+    parser.add_argument(
+        "--localisation",
+        choices=get_args(Localisation),
+        default=FrameSettings.localisation,
+        help="who says where the robot is in the plan's frame: /tf, or the topic pose",
+    )
+    parser.add_argument(
+        "--localisation-timeout",
+        type=float,
+        default=FrameSettings.localisation_timeout_s,
+        metavar="SECONDS",
+        help="stand when the localisation's newest word is older (default: %(default)s; inf: never for that)",
+    )
+    parser.add_argument("--base-frame", help="the robot's frame; else the odometry's child_frame_id")
+    parser.add_argument("--use-sim-time", action="store_true", help="the clock is that of the topic clock")
     parser.add_argument(
         "--remap",
         action="append",
@@ -131,6 +193,21 @@ def _parser() -> argparse.ArgumentParser:
         help="a topic that is called otherwise, such as plan:=/nav/path; may be given several times",
     )
     return parser
+
+
+def _mount(args: argparse.Namespace) -> Mount | None:
+    """Return where the scanner is said to sit; None where /tf is to say it."""
+    if args.laser is None and not args.laser_upside_down:
+        return None
+    x_m, y_m, yaw_rad = args.laser or (0.0, 0.0, 0.0)
+    return Mount(x_m, y_m, yaw_rad, args.laser_upside_down)
+
+
+def _view_rad(frame: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise UserInputError(f"--camera {frame}: a view of {text} is no number: give radians") from None
 
 
 def _renaming(text: str) -> tuple[str, str]:

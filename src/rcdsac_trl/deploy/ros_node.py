@@ -1,36 +1,44 @@
 """A ROS 2 node around :class:`~rcdsac_trl.deploy.policy.driver.Driver`; the one file that needs ``rclpy``.
 
 Run it where ROS 2 is sourced: ``python -m rcdsac_trl.deploy.ros_node --ros-args -p agent:=<name or folder>``.
-It reads ``scan``, ``odom`` and ``plan``, writes ``cmd_vel`` (``geometry_msgs/TwistStamped``, or ``Twist`` with the
-parameter ``command_type``) and the return's quantiles on ``return_quantiles``. ``beta`` and ``stop`` may be set while
-it runs; ``zero_means`` says what the scanner's driver means by a reading of 0.
+It reads ``scan`` (or clouds), ``odom``, ``plan``, ``/tf`` and ``/tf_static``; it writes ``cmd_vel``
+(``geometry_msgs/TwistStamped``, or ``Twist`` with the parameter ``command_type``), the return's quantiles on
+``return_quantiles``, and on ``drive_status`` why the robot does not go as the agent would. ``beta`` and ``stop`` may be
+set while it runs; every parameter is explained in docs/nav2.md.
 """
 
 import importlib
 import math
 import sys
+from functools import partial
 from typing import Any
 
 import rclpy
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import LaserScan
-from std_msgs.msg import Float32MultiArray
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import LaserScan, PointCloud2
+from std_msgs.msg import Float32MultiArray, String
+from tf2_msgs.msg import TFMessage
 
 import rcdsac_trl
+from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
-from rcdsac_trl.deploy.ros.topics import readers_of, writers_of
-from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of
+from rcdsac_trl.deploy.ros.topics import DRIVING, readers_of, without_numbers, writers_of
+from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
 
 # One node writes a topic as one type: not every middleware of ROS knows two of one name.
 _COMMAND_TYPES = {"TwistStamped": TwistStamped, "Twist": Twist}
-_NEEDED = {"scan": "sensor_msgs/msg/LaserScan", "odom": "nav_msgs/msg/Odometry", "plan": "nav_msgs/msg/Path"}
+_SCAN, _CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
+_NEEDED = {"odom": "nav_msgs/msg/Odometry", "plan": "nav_msgs/msg/Path"}
+# How tf2 publishes and reads.
+_TF_QOS = QoSProfile(depth=100)
+_STATIC_TF_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _REPORT_PERIOD_S = 2.0
 
 
@@ -39,34 +47,79 @@ class PolicyNode(Node):
 
     def __init__(self) -> None:
         super().__init__("rcdsac_trl")
-        agent = str(self.declare_parameter("agent", "").value)
-        upside_down = bool(self.declare_parameter("laser_upside_down", False).value)
-        zero_means = self.declare_parameter("zero_means", "unknown").value
-        self._command_type = str(self.declare_parameter("command_type", "TwistStamped").value)
+        agent = self._given("agent", "")
+        self._command_type = self._given("command_type", "TwistStamped")
         if self._command_type not in _COMMAND_TYPES:
             raise UserInputError(
                 f"command_type={self._command_type} is not one of {', '.join(_COMMAND_TYPES)}: choose one"
             )
-        policy = rcdsac_trl.load(agent)
-        own = mount_of(policy.robot.lidar)
-        places = {"x_m": own.x_m, "y_m": own.y_m, "yaw_rad": own.yaw_rad}
-        x_m, y_m, yaw_rad = (self.declare_parameter(f"laser_{name}", value).value for name, value in places.items())
-        self.driver = Driver(policy, mount=Mount(x_m, y_m, yaw_rad, upside_down), zero_means=zero_means)
+        cameras = self._cameras()
+        defaults = FrameSettings()
+        self.driver = Driver(
+            rcdsac_trl.load(agent),
+            mount=self._mount(),
+            cameras={frame: view_rad for frame, _, view_rad in cameras},
+            zero_means=self._given("zero_means", "invalid"),
+            nan_means=self._given("nan_means", "invalid"),
+            frames=FrameSettings(
+                self._given("localisation", defaults.localisation),
+                self._given("localisation_timeout_s", defaults.localisation_timeout_s),
+                self._given("base_frame", "") or None,
+            ),
+        )
+        self._needed = {topic: _CLOUD for _, topic, _ in cameras} or {"scan": _SCAN}
+        self._needed |= _NEEDED
         config = self.driver.policy.config
         # NaN stands for the agent's own default: ROS parameters know no null.
         self.declare_parameter("beta", math.nan)
         self.declare_parameter("stop", False)
         self.add_on_set_parameters_callback(self._set)
         self._set([self.get_parameter("beta"), self.get_parameter("stop")])
-        self.create_subscription(LaserScan, "scan", self.driver.on_scan, qos_profile_sensor_data)
-        self.create_subscription(Odometry, "odom", self.driver.on_odometry, qos_profile_sensor_data)
-        self.create_subscription(Path, "plan", self.driver.on_path, 1)
+        self._subscribe([topic for _, topic, _ in cameras])
         self._commands = self.create_publisher(_COMMAND_TYPES[self._command_type], "cmd_vel", 1)
         self._quantiles = self.create_publisher(Float32MultiArray, "return_quantiles", 1)
+        self._status = self.create_publisher(String, "drive_status", 1)
         self._said: str | None = None
         self._reported = ""
         self.create_timer(sum(config.period_s) / 2.0, self._drive)
         self.create_timer(_REPORT_PERIOD_S, self._report)
+
+    def _given(self, name: str, default: Any) -> Any:
+        """Declare a parameter, and return its value."""
+        return self.declare_parameter(name, default).value
+
+    def _mount(self) -> Mount | None:
+        """Return where the scanner is said to sit; None where /tf is to say it. NaN stands for not said."""
+        place = [self._given(f"laser_{name}", math.nan) for name in ("x_m", "y_m", "yaw_rad")]
+        upside_down = self._given("laser_upside_down", False)
+        if all(math.isnan(value) for value in place) and not upside_down:
+            return None
+        x_m, y_m, yaw_rad = (0.0 if math.isnan(value) else value for value in place)
+        return Mount(x_m, y_m, yaw_rad, upside_down)
+
+    def _cameras(self) -> list[tuple[str, str, float]]:
+        """Return frame, topic and horizontal field of view, rad, of each camera."""
+        frames, topics = self._given("camera_frames", [""]), self._given("camera_topics", [""])
+        views_rad = self._given("camera_views_rad", [math.nan])
+        if list(frames) == [""]:  # ROS knows no type of an empty list
+            return []
+        if not len(frames) == len(topics) == len(views_rad):
+            raise UserInputError(
+                f"camera_frames has {len(frames)} entries, camera_topics {len(topics)}, camera_views_rad "
+                f"{len(views_rad)}: give one a camera in each"
+            )
+        return list(zip(frames, topics, views_rad, strict=True))
+
+    def _subscribe(self, cloud_topics: list[str]) -> None:
+        driver = self.driver
+        self.create_subscription(LaserScan, "scan", driver.on_scan, qos_profile_sensor_data)
+        for topic in cloud_topics:
+            self.create_subscription(PointCloud2, topic, driver.on_cloud, qos_profile_sensor_data)
+        self.create_subscription(Odometry, "odom", driver.on_odometry, qos_profile_sensor_data)
+        self.create_subscription(Path, "plan", driver.on_path, 1)
+        self.create_subscription(TFMessage, "/tf", driver.on_transforms, _TF_QOS)
+        self.create_subscription(TFMessage, "/tf_static", partial(driver.on_transforms, static=True), _STATIC_TF_QOS)
+        self.create_subscription(PoseWithCovarianceStamped, "pose", driver.on_pose, 1)
 
     def _set(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
@@ -83,9 +136,11 @@ class PolicyNode(Node):
         self._commands.publish(twist_stamped(command, now_s, _made) if stamped else twist(command, _made))
         if command.quantiles is not None:
             self._quantiles.publish(Float32MultiArray(data=command.quantiles.tolist()))
-        if command.reason != self._said and command.reason is not None:
+        self._status.publish(String(data=command.reason or DRIVING))
+        kind = without_numbers(command.reason)
+        if kind != self._said and command.reason is not None:
             self.get_logger().warning(command.reason)
-        self._said = command.reason
+        self._said = kind
 
     def _report(self) -> None:
         """Tell who reads the commands, as which type, and which needed topics nobody writes, whenever it changes."""
@@ -94,7 +149,7 @@ class PolicyNode(Node):
         said = [readers_of("cmd_vel", [kind], readers)]
         if readers and kind not in readers:
             said.append(f"the parameter command_type chooses another of {', '.join(_COMMAND_TYPES)}")
-        for topic, needed in _NEEDED.items():
+        for topic, needed in self._needed.items():
             writers = [found.topic_type for found in self.get_publishers_info_by_topic(topic)]
             said.append(writers_of(topic, needed, writers) or "")
         report = "; ".join(filter(None, said))

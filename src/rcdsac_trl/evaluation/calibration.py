@@ -149,7 +149,7 @@ def _driver(
         split=settings.split,
         seed=settings.seed,
         agent_ids=states * len(conditions),
-        memory=trained.network.memory,
+        state_size=trained.network.state_size,
         conditions=[condition for condition in conditions for _ in range(group)],
     )
     latest = trained.task.episode_steps - settings.horizon_steps

@@ -9,11 +9,12 @@ from typing import Any
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.config.evaluation_settings import EvaluationSettings
+from rcdsac_trl.config.evaluation_settings import ChosenWorld, EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation.barn_runs import barn_runs, timed
 from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
@@ -30,6 +31,7 @@ from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
+from rcdsac_trl.world.maps.map_source import check_maps, with_digests
 from rcdsac_trl.world.sim.bullet import check_display
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -38,7 +40,8 @@ from rcdsac_trl.world.task.world_settings import WorldSettings
 def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     """Make an evaluation of a run or a baseline; refuses before anything is written.
 
-    It writes ``episodes.csv``, ``summary.csv``, ``collisions.csv``, ``evaluation.json`` and, if asked for, films.
+    It writes ``episodes.csv``, ``summary.csv``, ``collisions.csv``, ``evaluation.json`` and, if asked for, films; of
+    BARN's protocol ``runs.csv`` and ``barn.json``.
 
     Raises:
         UserInputError: for a missing run, a beta that is missing or outside its domain, a sensor that does not fit, a
@@ -51,10 +54,14 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
         check_display()
     named = None if settings.run is None else named_agent(settings.run, settings.checkpoint)
     trained = default_training() if named is None else named.settings
-    spec = _spec(settings, trained)
+    chosen = settings.world_of(trained)
+    check_maps(chosen.maps, chosen.task.min_path_m, settings.robot_of(trained).circumradius_m)
+    worlds = [] if chosen.barn is None else timed(chosen.barn.worlds()[: settings.num_maps])
+    num_maps = len(worlds) or settings.num_maps
+    spec = _spec(settings, trained, chosen)
     if settings.baseline is not None:
         check_baseline(settings.baseline, spec.world.sensor, spec.world.robot)
-    processes = 0 if settings.gui else resolve_processes(settings.num_workers, settings.num_maps)
+    processes = 0 if settings.gui else resolve_processes(settings.num_workers, num_maps)
     simulations = max(1, processes) * spec.world.num_agents
     remedy = "lower num_episodes or num_workers, or end other programs"
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
@@ -70,27 +77,27 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
 
     def maps(watch: Watch) -> Generator[Rows, None, None]:
         make = partial(map_evaluator, spec, *(agent() or (None,)))
-        return evaluate_maps(make, settings.num_maps, processes, watch)
+        return evaluate_maps(make, num_maps, processes, watch)
 
     def film(folder: Path, rows: Rows) -> list[Path]:
         headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in spec.conditions]
         return write_film(spec, agent(), settings.video, headings, folder)
 
     return MeasuredRun(
-        kind="evaluation",
-        out=Path(settings.out) if settings.out is not None else _default_out(settings, spec, named),
-        described=_described(settings, spec, named),
+        kind="barn" if worlds else "evaluation",
+        out=Path(settings.out) if settings.out is not None else _default_out(settings, spec, named, num_maps),
+        described=_described(settings, spec, named, num_maps),
         unit="map",
-        num_units=settings.num_maps,
+        num_units=num_maps,
         unit_steps=spec.world.task.episode_steps,
         processes=processes,
         measure=maps,
-        findings=_findings,
+        findings=partial(barn_runs, worlds) if worlds else _findings,
         film=film if settings.record else None,
     )
 
 
-def _spec(settings: EvaluationSettings, trained: TrainingSettings) -> EvaluationSpec:
+def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: ChosenWorld) -> EvaluationSpec:
     conditions = [Condition()]
     if settings.run is not None:
         conditions = trained.algo.conditions(settings.beta, settings.collision_weight)
@@ -98,7 +105,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings) -> Evaluation
     conditions += [Condition(controller=name) for name in controllers]
     return EvaluationSpec(
         trained=trained,
-        world=_evaluation_world(settings, trained, len(conditions)),
+        world=_evaluation_world(settings, trained, chosen, len(conditions)),
         conditions=conditions,
         split=settings.split,
         seed=settings.seed,
@@ -109,6 +116,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings) -> Evaluation
         detailed=True,
         controller=settings.controller if controllers else None,
         baseline=settings.baseline or PURSUIT,
+        one_trip=chosen.barn is not None,
     )
 
 
@@ -117,8 +125,9 @@ def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
     return trained.algo.name if settings.baseline is None else settings.baseline
 
 
-def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None) -> Path:
-    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"
+def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None, num_maps: int) -> Path:
+    maps = "barn" if spec.one_trip else settings.split
+    name = f"{maps}-seed{settings.seed}-{num_maps}x{settings.num_episodes}"
     if named is None:
         if spec.world.robot != PAPER:
             name = f"{spec.world.robot.name}-{name}"
@@ -127,7 +136,9 @@ def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: Name
     return named.folder_of("evaluation", f"{name}{contexts}")
 
 
-def _described(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None) -> dict[str, Any]:
+def _described(
+    settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None, num_maps: int
+) -> dict[str, Any]:
     """Say what is measured and how."""
     trained = spec.trained
     described = {
@@ -140,7 +151,7 @@ def _described(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedA
         **({"checkpoint": None} if named is None else named.described),
         "split": settings.split,
         "seed": settings.seed,
-        "num_maps": settings.num_maps,
+        "num_maps": num_maps,
         "num_episodes": settings.num_episodes,
         "sampled": settings.sampled,
         "conditions": [str(condition) for condition in spec.conditions],
@@ -168,8 +179,10 @@ def _findings(rows: Rows) -> Findings:
     )
 
 
-def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, num_conditions: int) -> WorldSettings:
-    maps, sensor, task = settings.world_of(trained)
+def _evaluation_world(
+    settings: EvaluationSettings, trained: TrainingSettings, chosen: ChosenWorld, num_conditions: int
+) -> WorldSettings:
+    sensor = chosen.sensor
     if settings.run is None:
         sensor = replace(sensor, memory_s=0.0)  # baselines do not read what is remembered
     # Who chooses the sensor's name alone chooses no memory.
@@ -181,8 +194,8 @@ def _evaluation_world(settings: EvaluationSettings, trained: TrainingSettings, n
             f"sensor={trained.sensor.name} sensor.memory_s={trained.sensor.memory_s:g}, leave both out"
         )
     return WorldSettings(
-        map_settings=maps,
-        task=task,
+        map_settings=with_digests(chosen.maps),
+        task=chosen.task,
         sensor=sensor.name,
         memory_s=sensor.memory_s,
         num_agents=settings.num_episodes * num_conditions,

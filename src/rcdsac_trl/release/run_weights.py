@@ -123,6 +123,7 @@ def agent_config(
         padding=agent.network.padding,
         memory_s=agent.sensor.memory_s,
         range_code=agent.network.range_code,
+        restart_steps=agent.network.restart_steps,
         robot=agent.robot,
     )
 

@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.dead_reckoning import DeadReckoning
+from rcdsac_trl.robot.foreseen_clearance import ForeseenClearance
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.observation import (
+    NUM_FORESEEN_COMMANDS,
     NUM_REMEMBERED_MOVERS,
     NUM_REMEMBERED_SECTORS,
     REMEMBERED_MOVER_SIZE,
     REMEMBERED_SIZE,
 )
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
-from rcdsac_trl.robot.robot_settings import PAPER
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
 
 _SECTOR_RAD = 2.0 * math.pi / NUM_REMEMBERED_SECTORS
@@ -54,20 +56,16 @@ class RememberedRanges:
         >>> ranges_m[0] = 0.48
         >>> told = remembered.observe(ranges_m, v=0.0, omega=0.0, elapsed_s=0.0)
         >>> told.shape, round(float(told[0]), 6)
-        ((46,), 1.0)
+        ((65,), 1.0)
     """
 
-    def __init__(
-        self,
-        sensed: NDArray[np.bool_],
-        memory_s: float,
-        max_range_m: float = PAPER.lidar.max_range_m,
-        inner_radius_m: float = PAPER.body_radius_m,
-    ) -> None:
+    def __init__(self, sensed: NDArray[np.bool_], memory_s: float, robot: RobotSettings = PAPER) -> None:
+        max_range_m = robot.lidar.max_range_m
         self._sensed = np.ascontiguousarray(sensed, np.bool_)
         self._memory_s = memory_s
         self._max_range_m = max_range_m
-        self._reach_m = max_range_m, inner_radius_m
+        self._reach_m = max_range_m, robot.body_radius_m
+        self._foreseen = ForeseenClearance(robot)
         num_cells = math.ceil(round(2.0 * max_range_m / _CELL_M, 6)) + _SPARE_CELLS
         # Rows of x and y in m, frame of the dead reckoning, and when it was seen, s; a row for every cell at most.
         self._points = np.empty((num_cells**2, 3))
@@ -123,11 +121,13 @@ class RememberedRanges:
                 read either, so what is remembered there stays.
 
         Returns:
-            float32 [46]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
+            float32 [65]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
             degrees, counter-clockwise from straight ahead: log10((R - r) / (distance - r)) with the sensor's reach R,
             3 m, and the inner radius r, 0.2 m; 0 where nothing is known within R.
             Then, for each of the two nearest things that move: its nearness, that times the cosine and the sine of its
             bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
+            Last, for each of 19 commands, how near it would lead to all that; see
+            :class:`~rcdsac_trl.robot.foreseen_clearance.ForeseenClearance`.
         """
         self._reckoning.move(v, omega, elapsed_s)
         sensed = self._sensed if measured is None else self._sensed & measured
@@ -137,12 +137,15 @@ class RememberedRanges:
         moving = self._tracks.moving
         told = np.zeros(REMEMBERED_SIZE, np.float32)
         points, cells, rows = self._points, self._cells, self._rows
-        far_m, before_s = self._max_range_m, time_s - self._memory_s
-        number = _forget(points, cells, rows, self._number, pose, before_s, seen_m, sensed, moving, far_m)
-        self._number = _add(points, cells, rows, number, pose, time_s, seen_m, sensed, moving, far_m)
+        far_m, oldest_s = self._max_range_m, time_s - self._memory_s
+        number = _forget(points, cells, rows, self._number, pose, oldest_s, seen_m, sensed, moving, far_m)
+        # As old as what is forgotten when the mover's track ends.
+        of_mover_s = oldest_s + min(self._tracks.settings.coast_s, self._memory_s)
+        self._number = _add(points, cells, rows, number, pose, time_s, of_mover_s, seen_m, sensed, moving, far_m)
         self._moving = moving
         _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose, self._reach_m)
         _tell_movers(told, moving, pose, self._reach_m)
+        told[-NUM_FORESEEN_COMMANDS:] = self._foreseen.nearness(points[: self._number], moving, pose, v, omega)
         return told
 
 
@@ -169,7 +172,7 @@ def _forget(
         if not gone:
             bin_ = math.floor((math.atan2(y - pose[1], x - pose[0]) - pose[2]) / BIN_RAD) % NUM_BINS
             seen_through = distance_m < min(seen_m[bin_], far_m) - _CLEARING_MARGIN_M
-            gone = (sensed[bin_] and seen_through) or _is_of_a_mover(x, y, moving, False)
+            gone = (sensed[bin_] and seen_through) or _is_of_a_seen_mover(x, y, moving)
         if gone:
             rows[cells[row, 0], cells[row, 1]] = -1
             number -= 1
@@ -187,35 +190,34 @@ def _add(
     number: int,
     pose: np.ndarray,
     time_s: float,
+    of_mover_s: float,
     seen_m: np.ndarray,
     sensed: np.ndarray,
     moving: np.ndarray,
     far_m: float,
 ) -> int:
-    """Put a point into the middle of each sector that sees one, but for movers that are seen; return how many are."""
+    """Put a point into the middle of each sector that sees one, those of movers with a time of their own."""
     for bin_ in range(NUM_BINS):
         if not sensed[bin_] or seen_m[bin_] >= far_m:
             continue
         bearing = pose[2] + (bin_ + 0.5) * BIN_RAD
         x, y = pose[0] + seen_m[bin_] * math.cos(bearing), pose[1] + seen_m[bin_] * math.sin(bearing)
-        if _is_of_a_mover(x, y, moving, True):
-            continue
         i, j = math.floor(y / _CELL_M) % rows.shape[0], math.floor(x / _CELL_M) % rows.shape[1]
         row = rows[i, j]
         if row < 0:
             row = rows[i, j] = number
             cells[row, 0], cells[row, 1] = i, j
             number += 1
-        points[row, 0], points[row, 1], points[row, 2] = x, y, time_s
+        points[row, 0], points[row, 1] = x, y
+        points[row, 2] = of_mover_s if _is_of_a_seen_mover(x, y, moving) else time_s
     return number
 
 
 @njit
-def _is_of_a_mover(x: float, y: float, moving: np.ndarray, seen_now: bool) -> bool:
-    """Say whether a point belongs to what moves; where that is itself not seen its place is a guess."""
+def _is_of_a_seen_mover(x: float, y: float, moving: np.ndarray) -> bool:
+    """Say whether a point belongs to what is seen moving."""
     for mover_x, mover_y, _, _, radius, unseen_s in moving:
-        near = math.hypot(x - mover_x, y - mover_y) < radius + _MOVER_MARGIN_M
-        if near and (unseen_s == 0.0 or not seen_now):
+        if unseen_s == 0.0 and math.hypot(x - mover_x, y - mover_y) < radius + _MOVER_MARGIN_M:
             return True
     return False
 

@@ -21,7 +21,7 @@ def environment(
     split: Split,
     seed: int,
     agent_ids: Sequence[int],
-    memory: int,
+    state_size: int,
     conditions: Sequence[Condition] | None = None,
     first_episode: int = 0,
 ) -> EnvBase:
@@ -33,7 +33,7 @@ def environment(
         split: training, validation or evaluation maps.
         seed: root seed of maps, starts, goals, movers and of what the agents are told.
         agent_ids: numbers of the agents; equal numbers meet the same starts and goals.
-        memory: size of the policy's recurrent state.
+        state_size: size of the policy's recurrent state.
         conditions: tell agent i ``conditions[i]``; None draws what they are told an episode.
         first_episode: number of each agent's first episode.
     """
@@ -48,7 +48,7 @@ def environment(
     env = TransformedEnv(base)
     env.append_transform(InitTracker())
     env.append_transform(StepCounter(max_steps=world.task.episode_steps))
-    env.append_transform(recurrent_state_primer(memory))
+    env.append_transform(recurrent_state_primer(state_size))
     sampler = _sampler(algo, seed, agent_ids, conditions, first_episode)
     if sampler is not None:
         env.append_transform(sampler)
@@ -62,7 +62,7 @@ def rollout_worker(
     split: Split,
     seed: int,
     agent_ids: Sequence[int],
-    memory: int,
+    state_size: int,
     conditions: Sequence[Condition] | None = None,
 ) -> RolloutWorker:
     """Make agents of this process that drive whole episodes; arguments as for :func:`environment`."""
@@ -74,7 +74,7 @@ def rollout_worker(
         weighted_collisions=_is_weighted(algo),
     )
     sampler = _sampler(algo, seed, agent_ids, conditions, 0)
-    return RolloutWorker(env, sampler, memory=memory, steps=world.task.episode_steps)
+    return RolloutWorker(env, sampler, state_size=state_size, steps=world.task.episode_steps)
 
 
 def _is_weighted(algo: AlgoSettings | None) -> bool:
@@ -125,7 +125,7 @@ def evaluation_worker(
     split: Split,
     seed: int,
     num_agents: int,
-    memory: int,
+    state_size: int,
 ) -> RolloutWorker:
     """Make a worker in which a block of agents drives under each condition, side by side on the same map."""
     return rollout_worker(
@@ -134,6 +134,6 @@ def evaluation_worker(
         split=split,
         seed=seed,
         agent_ids=list(range(num_agents)) * len(conditions),
-        memory=memory,
+        state_size=state_size,
         conditions=[condition for condition in conditions for _ in range(num_agents)],
     )

@@ -99,7 +99,7 @@ def _worker(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Dr
         split=SPLIT,
         seed=settings.seed,
         agent_ids=agent_ids,
-        memory=settings.network.memory,
+        state_size=settings.network.state_size,
     )
     actor = make_actor(settings)
     policy = _collection_policy(settings, partial(make_policy, actor, device="cpu"), agent_ids)
@@ -138,7 +138,7 @@ def _by_torchrl(
             split=SPLIT,
             seed=settings.seed,
             agent_ids=agent_ids,
-            memory=settings.network.memory,
+            state_size=settings.network.state_size,
             first_episode=map_index,  # episode k of every agent is on map k
         )
         return Collector(

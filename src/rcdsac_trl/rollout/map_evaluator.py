@@ -56,6 +56,7 @@ class EvaluationSpec:
         detailed: measure the ways driven and say of each collision what was hit, too.
         controller: settings of controllers, which then tell all agents beta; None: nothing turns it.
         baseline: what drives where there is no actor.
+        one_trip: drive to the first goal alone; see :func:`~rcdsac_trl.rollout.measurement.measure_map`.
     """
 
     trained: TrainingSettings
@@ -70,6 +71,7 @@ class EvaluationSpec:
     detailed: bool = False
     controller: ControllerSettings | None = None
     baseline: str = PURSUIT
+    one_trip: bool = False
 
 
 class Agent(NamedTuple):
@@ -99,8 +101,8 @@ def map_evaluator(
     threads = torch.get_num_threads()
     runtime.set_threads(spec.threads)
     algo = None if actor is None else spec.trained.algo
-    memory = spec.trained.network.memory
-    worker = evaluation_worker(spec.world, algo, spec.conditions, spec.split, spec.seed, spec.num_episodes, memory)
+    state_size = spec.trained.network.state_size
+    worker = evaluation_worker(spec.world, algo, spec.conditions, spec.split, spec.seed, spec.num_episodes, state_size)
     # An episode's noise is its own: the same under every condition, whichever they are and in whatever order.
     agent_ids = [*range(spec.num_episodes)] * len(spec.conditions)
     noise = AgentNoise(agent_ids)
@@ -131,6 +133,7 @@ def map_evaluator(
             map_index=map_index,
             sampled=spec.sampled,
             controlled=spec.controller is not None,
+            one_trip=spec.one_trip,
             before_step=before_step,
             more=partial(_all, more, map_index) if more else None,
         )

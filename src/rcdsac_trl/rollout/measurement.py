@@ -1,10 +1,12 @@
 """A policy measured on one map: one row an episode."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -32,6 +34,7 @@ def measure_map(
     map_index: int,
     sampled: bool = False,
     controlled: bool = False,
+    one_trip: bool = False,
     before_step: Callable[[], None] = interruption_point,
     more: Callable[[TensorDictBase], dict[str, Tensor]] | None = None,
 ) -> Rows:
@@ -46,6 +49,8 @@ def measure_map(
         map_index: number of the map and its episode.
         sampled: draw actions instead of taking tanh(mean).
         controlled: say in `beta_controller` what turned beta.
+        one_trip: end the map once every agent has reached its first goal or touched something; what is counted over an
+            episode then says little.
         before_step: called before each step.
         more: measures more of the episodes, ``[N]`` a column.
 
@@ -55,7 +60,14 @@ def measure_map(
     """
     kind = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     with torch.no_grad(), set_exploration_type(kind):
-        driven = worker.rollout(policy, map_index, observed=_OBSERVED, happened=HAPPENED, before_step=before_step)
+        driven = worker.rollout(
+            policy,
+            map_index,
+            observed=_OBSERVED,
+            happened=HAPPENED,
+            before_step=before_step,
+            ended=_TripsEnded(len(conditions) * num_agents) if one_trip else None,
+        )
     episodes = driven.tensordict()
     measured = episode_metrics(episodes) | ({} if more is None else more(episodes))
     rows = []
@@ -71,6 +83,21 @@ def measure_map(
             row["beta_controller"] = condition.controller
         rows.append(row | {metric: values[i].item() for metric, values in measured.items()})
     return rows
+
+
+class _TripsEnded:
+    """Tells whether every agent has reached a goal or touched something before this step.
+
+    So a step follows the last of them: who watches agents as they act, as a film does, sees how it ended.
+    """
+
+    def __init__(self, num_agents: int) -> None:
+        self._ended = np.zeros(num_agents, np.bool_)
+
+    def __call__(self, written: Mapping[str, NDArray]) -> bool:
+        over = bool(self._ended.all())
+        self._ended |= (written["contact"] | written["goal_reached"])[:, 0]
+        return over
 
 
 def table_of(maps: Iterable[Rows]) -> pd.DataFrame:

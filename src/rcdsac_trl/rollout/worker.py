@@ -5,7 +5,7 @@ worker therefore steps the environment's own arrays, and writes what is asked fo
 numbers are, bit by bit, those of the environment with its transforms.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -60,14 +60,14 @@ class RolloutWorker:
     Args:
         env: holds the agents.
         sampler: what the agents are told; None: nothing.
-        memory: size of the policy's recurrent state.
+        state_size: size of the policy's recurrent state.
         steps: length of an episode.
     """
 
-    def __init__(self, env: NavigationEnv, sampler: EpisodeSampler | None, *, memory: int, steps: int) -> None:
+    def __init__(self, env: NavigationEnv, sampler: EpisodeSampler | None, *, state_size: int, steps: int) -> None:
         self.env = env
         self.sampler = sampler
-        self.memory = memory
+        self.state_size = state_size
         self.steps = steps
 
     def rollout(
@@ -78,6 +78,7 @@ class RolloutWorker:
         observed: Sequence[str],
         happened: Sequence[str],
         before_step: Callable[[], None] = interruption_point,
+        ended: Callable[[Mapping[str, NDArray]], bool] | None = None,
     ) -> EpisodeBatch:
         """Drive one episode with every agent.
 
@@ -87,6 +88,8 @@ class RolloutWorker:
             observed: keys to return of the observations.
             happened: keys to return of what the steps led to.
             before_step: called before each step.
+            ended: given what the agents wrote after each step; returns whether all episodes may end now. None: they
+                take their full length.
         """
         agents, number = self.env.agents, len(self.env.agents)
         agents.reset(range(number), episode)
@@ -96,7 +99,7 @@ class RolloutWorker:
         # Made once: the agents write into the same arrays at every step.
         now = TensorDict({key: torch.from_numpy(written[key]) for key in agents.observations} | context, [number])
         now["is_init"] = torch.ones(number, 1, dtype=torch.bool, device="cpu")
-        now[STATE_KEY] = torch.zeros(number, self.memory, dtype=torch.float32, device="cpu")
+        now[STATE_KEY] = torch.zeros(number, self.state_size, dtype=torch.float32, device="cpu")
         seen = {key: _empty_rows(written[key], self.steps + 1) for key in observed}
         done = {key: _empty_rows(written[key], self.steps) for key in happened}
         done["action"] = np.empty((number, self.steps, ACTION_SIZE), np.float32)
@@ -111,6 +114,10 @@ class RolloutWorker:
             if (state := now.get(("next", STATE_KEY), None)) is not None:
                 now[STATE_KEY] = state
             now["is_init"].fill_(False)
+            if ended is not None and ended(written):
+                seen = {key: value[:, : step + 2] for key, value in seen.items()}
+                done = {key: value[:, : step + 1] for key, value in done.items()}
+                break
         return EpisodeBatch(seen, done, {key: value.numpy() for key, value in context.items()})
 
     def close(self) -> None:

@@ -8,8 +8,8 @@ import safetensors.torch
 from tensordict import TensorDict
 
 from rcdsac_trl.storage import atomic
-from rcdsac_trl.storage.replay import SequenceReplay
 from rcdsac_trl.storage.replay_segments import Segment
+from rcdsac_trl.storage.sequence_replay import SequenceReplay
 
 
 class ReplayFiles:

@@ -8,7 +8,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.agent.transforms import Mirror, Relabel
 from rcdsac_trl.rollout.make_agent import packed
-from rcdsac_trl.storage.replay import SequenceReplay
+from rcdsac_trl.storage.sequence_replay import SequenceReplay
 from rcdsac_trl.system.interrupts import interruption_point
 
 LOSS_KEYS = ("loss_qvalue", "loss_actor", "loss_alpha")

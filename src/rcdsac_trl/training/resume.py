@@ -131,4 +131,6 @@ def _comparable(cfg: DictConfig) -> dict[str, Any]:
     values.pop("resume", None)
     # Runs of earlier versions name none.
     values.setdefault("robot", OmegaConf.to_container(OmegaConf.load(CONF_DIR / "robot" / "paper.yaml")))
+    if isinstance(maps := values.get("map"), dict):
+        maps.pop("sha256", None)  # noted as the run began; whether the files are still those is asked when it goes on
     return values

@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.agent.kernels import matmul
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
 from rcdsac_trl.agent.transforms import Mirror
-from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_new_run, settings_of_run
+from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_new_run, settings_of_run, with_map_digests
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, make_optimizer, make_relabel, packed, parameters
@@ -23,8 +23,8 @@ from rcdsac_trl.rollout.map_evaluator import EvaluationSpec, map_evaluator
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint import Checkpoints, Generators, load_average, rotate
 from rcdsac_trl.storage.checkpoint_record import DamagedError, Progress, Saved, best_damage, folder_name, newest
-from rcdsac_trl.storage.replay import SequenceReplay, replay_bytes
 from rcdsac_trl.storage.replay_files import ReplayFiles
+from rcdsac_trl.storage.sequence_replay import SequenceReplay, replay_bytes
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.processes import check_may_start_processes, resolve_processes, resolve_processes_beside
@@ -35,6 +35,7 @@ from rcdsac_trl.training.run_folder import check_folder, cut, has_begun, start_r
 from rcdsac_trl.training.run_log import RunLog
 from rcdsac_trl.training.trainer import IterationHook, Trainer, saved_sentence
 from rcdsac_trl.training.validation import Snapshot, SnapshotEvaluator, Validation
+from rcdsac_trl.world.maps.map_source import check_maps
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 
 # Validation looks at the same maps whatever seed a run is trained with.
@@ -155,6 +156,7 @@ def make_trainer(
     Raises:
         UserInputError: as :func:`check_training`, or if another process trains in the folder, or it holds a run.
     """
+    cfg = with_map_digests(cfg)
     settings = check_training(cfg)
     facts = {
         "overrides": list(overrides),
@@ -184,6 +186,7 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
     settings = settings_of_run(folder, key="resume")
     resources.check_writable(folder)
     settings.collector.check_package()
+    check_maps(settings.map, settings.task.min_path_m, settings.robot.circumradius_m)
     _check_processes(settings)
     _check_memory(settings)
     lock = FolderLock(folder)

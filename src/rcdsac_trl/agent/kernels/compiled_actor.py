@@ -90,11 +90,10 @@ def _range_features(bins: Floats, weights: "Weights", out: Floats) -> None:
 
 
 @_compiled
-def _recurrence(features: Floats, state: Floats, weights: "Weights") -> None:
+def _recurrence(inputs: Floats, state: Floats, weights: "Weights") -> None:
     """Advance the recurrent layer by one step, in place; PyTorch's order of the gates: r, z, n."""
     size = state.size
-    inputs, recurrent = weights.input_bias.copy(), weights.recurrent_bias.copy()
-    _add_product(features, weights.input, inputs)
+    recurrent = weights.recurrent_bias.copy()
     _add_product(state, weights.recurrent, recurrent)
     one = np.float32(1)
     for i in range(size):
@@ -102,6 +101,22 @@ def _recurrence(features: Floats, state: Floats, weights: "Weights") -> None:
         z = one / (one + np.exp(-(inputs[size + i] + recurrent[size + i])))
         n = np.tanh(inputs[2 * size + i] + r * recurrent[2 * size + i])
         state[i] = n + z * (state[i] - n)
+
+
+@_compiled
+def _remember(features: Floats, state: Floats, weights: "Weights") -> None:
+    """Advance a state by one observation, in place; see :class:`rcdsac_trl.agent.networks.Encoder`."""
+    size = weights.recurrent.shape[0]
+    inputs = weights.input_bias.copy()
+    _add_product(features, weights.input, inputs)
+    if weights.restart_steps > 0:
+        younger = state[size : 2 * size]
+        if state[2 * size] >= weights.restart_steps:
+            state[:size] = younger
+            state[size:] = 0
+        _recurrence(inputs, younger, weights)
+        state[2 * size] += 1
+    _recurrence(inputs, state[:size], weights)
 
 
 @_compiled
@@ -118,8 +133,8 @@ def _act(agents: "Agents", weights: "Weights") -> None:
         _range_features(ranges[agent], weights, features[:num_range])
         _layer(vectors[agent], weights.vectors, weights.vectors_bias, features[num_range:])
         state = states[agent]
-        _recurrence(features, state, weights)
-        _layer(state, weights.head, weights.head_bias, head)
+        _remember(features, state, weights)
+        _layer(state[: weights.recurrent.shape[0]], weights.head, weights.head_bias, head)
         if cosines.size > 0:
             for c in range(cosines.size):
                 cosines[c] = np.cos(embedded[agent] * weights.frequencies[c])
@@ -141,7 +156,7 @@ class Agents(NamedTuple):
     ranges: Floats  # padded, [N, bins]
     vectors: Floats  # one behind the other, [N, k]
     embedded: Floats  # beta, [N]
-    states: Floats  # advanced in place, [N, memory]
+    states: Floats  # advanced in place, [N, state]
     noise: Floats  # [N, action]
     loc: Floats  # written, [N, action], as the other two
     scale: Floats
@@ -174,6 +189,7 @@ class Weights(NamedTuple):
     hidden_bias: Floats
     output: Floats
     output_bias: Floats
+    restart_steps: int  # 0: the state never restarts
 
 
 def _copied(encoder: Any, head: Any) -> Weights:
@@ -211,7 +227,8 @@ def _copied(encoder: Any, head: Any) -> Weights:
         "output": head.output.weight.t(),
         "output_bias": head.output.bias,
     }
-    return Weights(**{name: np.array(value.detach().numpy(), order="C") for name, value in tensors.items()})
+    arrays = {name: np.array(value.detach().numpy(), order="C") for name, value in tensors.items()}
+    return Weights(**arrays, restart_steps=encoder.restart_steps or 0)
 
 
 class CompiledActor:
@@ -257,7 +274,7 @@ class CompiledActor:
             vectors: the vector observations ``[N, size]``, in the actor's order.
             risk: beta, ``[N, 1]``; None where the actor reads none.
             is_init: ``[N, 1]``, whether this is an episode's first observation: the state is then zero.
-            state: recurrent state, ``[N, memory]``; left as it is.
+            state: recurrent state, ``[N, state_size]``; left as it is.
             noise: standard normal, ``[N, action]``; None for the deterministic action, tanh(loc).
 
         Returns:

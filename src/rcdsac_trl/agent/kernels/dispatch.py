@@ -15,7 +15,15 @@ from torch import Tensor, nn
 from rcdsac_trl.agent.kernels.observation_features import observation_features
 from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
 from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
-from rcdsac_trl.agent.networks import ActorHead, CosineFeatures, Encoder, HistoryEncoder, QuantileHead, RangeFeatures
+from rcdsac_trl.agent.networks import (
+    ActorHead,
+    CosineFeatures,
+    Encoder,
+    HistoryEncoder,
+    QuantileHead,
+    RangeFeatures,
+    in_turn,
+)
 from rcdsac_trl.robot.ring import KERNELS
 
 #: Below this number, one call of a layer costs more than what it computes.
@@ -107,7 +115,11 @@ def _encode(encoder: Any, *inputs: Any) -> Tensor:
     # Step after step, as the recurrence reads them.
     rows = [value.transpose(0, 1).reshape(sequences * steps, -1) for value in inputs]
     features = _features(encoder, rows)
-    return gated_recurrence(features.view(steps, sequences, -1), encoder.gru).transpose(0, 1)
+
+    def run(part: Tensor) -> Tensor:
+        return gated_recurrence(part.transpose(0, 1), encoder.gru).transpose(0, 1)
+
+    return in_turn(run, features.view(steps, sequences, -1).transpose(0, 1), encoder.restart_steps)
 
 
 def _features(encoder: Any, rows: Sequence[Tensor]) -> Tensor:

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rcdsac_trl.deploy.export.modules import ACTION_SIZE, ActorStep, CriticStep
+from rcdsac_trl.deploy.export.modules import ACTION_SIZE, ActorStep, CriticStep, network_of
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.policy.policy import fractions_of
 from rcdsac_trl.deploy.policy.weights import Weights
@@ -145,7 +145,7 @@ def example_inputs(weights: Weights) -> dict[str, Array]:
 
 
 def _memory(weights: Weights) -> tuple[Array, Array]:
-    size = weights.config.network["memory"]
+    size = network_of(weights.config).state_size
     return np.zeros((1, size), np.float32), np.zeros((weights.config.num_critics, 1, size), np.float32)
 
 
@@ -221,8 +221,8 @@ def _torch_runner(module: Callable[..., tuple[Tensor, Tensor]], names: tuple[str
 def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Runner]:
     config, mask = weights.config, weights.config.sensor_mask
     critic_encoders = [weights.part(f"critics.{number}.encoder") for number in range(config.num_critics)]
-    own = Encoders([weights.part("actor.encoder")], mask, config.padding, config.range_code)
-    theirs = Encoders(critic_encoders, mask, config.padding, config.range_code)
+    how = config.padding, config.range_code, config.restart_steps
+    own, theirs = Encoders([weights.part("actor.encoder")], mask, *how), Encoders(critic_encoders, mask, *how)
     actor, critics = Actor(weights), Critics(weights, fractions)
 
     def told(inputs: dict[str, Array]) -> tuple[Array, float | None]:
@@ -235,12 +235,13 @@ def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Run
 
     def act(inputs: dict[str, Array]) -> tuple[Array, Array]:
         vectors, embedded = told(inputs)
-        memory = own.step(inputs["range"][0], vectors, inputs["memory"])
-        return actor.action(memory[0], embedded)[None], memory
+        state = own.step(inputs["range"][0], vectors, inputs["memory"])
+        return actor.action(state[0, : own.memory_size], embedded)[None], state
 
     def judge(inputs: dict[str, Array]) -> tuple[Array, Array]:
         vectors, embedded = told(inputs)
-        memories = theirs.step(inputs["range"][0], vectors, inputs["memories"][:, 0])
-        return critics.values(memories, inputs["action"][0], embedded)[None], memories[:, None]
+        states = theirs.step(inputs["range"][0], vectors, inputs["memories"][:, 0])
+        memories = states[:, : theirs.memory_size]
+        return critics.values(memories, inputs["action"][0], embedded)[None], states[:, None]
 
     return [act, judge]

@@ -29,7 +29,7 @@ class ActorStep(nn.Module):
     @classmethod
     def of_weights(cls, weights: Weights) -> Self:
         """Make the step of an agent's actor."""
-        config, network = weights.config, _network_of(weights.config)
+        config, network = weights.config, network_of(weights.config)
         encoder, head = Encoder(config.vectors, network), ActorHead(ACTION_SIZE, network, measure_of(config))
         _load(encoder, weights, "actor.encoder")
         _load(head, weights, "actor.head")
@@ -44,15 +44,15 @@ class ActorStep(nn.Module):
         memory: Tensor,
         remembered: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return the action tanh(mean) [B, 2] and the encoder's next state, its memory, [B, memory].
+        """Return the action tanh(mean) [B, 2] and the encoder's next state [B, state].
 
         Args:
             range_: range observation, [B, 180].
             waypoint: [B, 6].
             velocity: [B, 4].
             context: ``beta`` or the collision weight, [B, 1]; not read by an agent that is told neither.
-            memory: [B, memory]; zeros at the start.
-            remembered: [B, 46], of an agent that is told what it saw.
+            memory: the state, [B, state]; zeros at the start.
+            remembered: [B, 65], of an agent that is told what it saw.
         """
         vectors = (waypoint, velocity, remembered, context if self.weighted else None)
         read, after = _encode(self.encoder, range_, vectors, memory)
@@ -72,7 +72,7 @@ class CriticStep(nn.Module):
 
     def __init__(self, weights: Weights, fractions: Tensor) -> None:
         super().__init__()
-        config, network = weights.config, _network_of(weights.config)
+        config, network = weights.config, network_of(weights.config)
         numbers = range(config.num_critics)
         self.encoders = nn.ModuleList(Encoder(config.vectors, network) for _ in numbers)
         self.heads = nn.ModuleList(_critic_head(config, network) for _ in numbers)
@@ -92,7 +92,7 @@ class CriticStep(nn.Module):
         memories: Tensor,
         remembered: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return quantiles in rising order [B, N] (or the mean [B, 1]) and the next memories [critics, B, memory].
+        """Return quantiles in rising order [B, N] (or the mean [B, 1]) and the next states [critics, B, state].
 
         Args:
             range_: range observation, [B, 180].
@@ -100,7 +100,7 @@ class CriticStep(nn.Module):
             velocity: [B, 4].
             context: as in :meth:`ActorStep.forward`, [B, 1].
             action: [B, 2].
-            memories: [critics, B, memory]; zeros at the start.
+            memories: the states, [critics, B, state]; zeros at the start.
             remembered: as in :meth:`ActorStep.forward`.
         """
         vectors = (waypoint, velocity, remembered, context if self.weighted else None)
@@ -123,8 +123,14 @@ def measure_of(config: AgentConfig) -> RiskMeasure | None:
     return make_measure(config.measure) if config.context == "beta" else None
 
 
-def _network_of(config: AgentConfig) -> NetworkSettings:
-    return NetworkSettings(padding=config.padding, range_code=config.range_code, **config.network)  # type: ignore[arg-type]
+def network_of(config: AgentConfig) -> NetworkSettings:
+    """Return what the networks of an agent are made of."""
+    return NetworkSettings(
+        padding=config.padding,
+        range_code=config.range_code,
+        restart_steps=config.restart_steps,
+        **config.network,  # type: ignore[arg-type]
+    )
 
 
 def _critic_head(config: AgentConfig, network: NetworkSettings) -> nn.Module:

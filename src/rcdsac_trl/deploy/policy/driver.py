@@ -1,11 +1,15 @@
 """The core of a ROS 2 node without ROS: it takes messages as they come, and gives a command when asked."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.frames.robot_frames import FrameSettings, RobotFrames
+from rcdsac_trl.deploy.frames.sensor_mounts import camera_of, mount_of, transform_of_camera, transform_of_mount
+from rcdsac_trl.deploy.frames.transform_buffer import TransformError
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
@@ -14,30 +18,53 @@ from rcdsac_trl.deploy.policy.poses import PoseWatch
 from rcdsac_trl.deploy.ros import messages
 from rcdsac_trl.deploy.sensors.arrays import described
 from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
-from rcdsac_trl.deploy.sensors.scan import ZeroMeans, check_zero_means
-from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of
+from rcdsac_trl.deploy.sensors.scan import Meaning, Scan, check_meaning
+from rcdsac_trl.deploy.sensors.sectors import Mount, Sectors, mount_of_lidar
 from rcdsac_trl.errors import UserInputError
 
 # Of the frames whose clouds are not expected, so many are named.
 _MOST_FRAMES = 5
 
 
+@dataclass(frozen=True)
+class Situation:
+    """What a policy was asked on.
+
+    Attributes:
+        pose: x and y in m and yaw in rad of the robot, in the path's frame.
+        waypoints: the next two, m, in the robot's frame, [2, 2].
+        ranges: what the sensors say, around that pose.
+        velocity: measured, m/s and rad/s.
+    """
+
+    pose: tuple[float, float, float]
+    waypoints: NDArray[np.float64]
+    ranges: Scan | Sectors
+    velocity: tuple[float, float]
+
+
 class Driver:
     """Keeps the newest message of each kind, and asks a policy on them.
 
-    A message that cannot be read is as good as none: the robot stands until a good one follows. Path and odometry must
-    be in the same frame, and so must be their messages' headers. A path in the frame of the one before is followed from
-    where the robot has got to on that one; see :meth:`PathFollower.replan`.
+    A message that cannot be read is as good as none: the robot stands until a good one follows. A path in another frame
+    than odometry, such as ``map``, needs transforms or poses that connect the two; see
+    :class:`~rcdsac_trl.deploy.frames.robot_frames.RobotFrames`. What a sensor saw at its stamp is brought to where the
+    robot is by then. A path in the frame of the one before is followed from where the robot has got to on that one; see
+    :meth:`PathFollower.replan`.
 
     Args:
         policy: that drives.
-        mount: where the laser scanner sits; None: where the robot's settings have it.
-        cameras: pose of each depth camera, by the ``frame_id`` of its clouds.
+        mount: where the laser scanner sits; None: as transforms say, or the robot's settings where there are none.
+        cameras: pose of each depth camera, by the ``frame_id`` of its clouds; its horizontal field of view alone, rad,
+            where transforms say the pose. A frame with "optical" in its name has z ahead, any other x.
         filter_: which points of clouds are obstacles; None: the defaults, without what is the robot itself.
         zero_means: what the scanner's driver means by a reading of 0; see :class:`Scan`.
+        nan_means: what it means by NaN.
+        frames: how the robot's place in the path's frame is known; None for the defaults.
 
     Attributes:
         beta: how much risk to take; None: the policy's default. May be set at any time.
+        situation: what the policy was asked on last; None where the last command did not ask it.
     """
 
     def __init__(
@@ -45,19 +72,26 @@ class Driver:
         policy: Policy,
         *,
         mount: Mount | None = None,
-        cameras: Mapping[str, CameraPose] | None = None,
+        cameras: Mapping[str, CameraPose | float] | None = None,
         filter_: CloudFilter | None = None,
-        zero_means: ZeroMeans = "unknown",
+        zero_means: Meaning = "invalid",
+        nan_means: Meaning = "invalid",
+        frames: FrameSettings | None = None,
     ) -> None:
-        check_zero_means(zero_means)
+        check_meaning("zero_means", zero_means)
+        check_meaning("nan_means", nan_means)
         self.policy = policy
         self.beta: float | None = None
+        self.situation: Situation | None = None
         self._robot = policy.config.robot
-        self._mount = mount or mount_of(self._robot.lidar)
+        self._mount = None if mount is None else transform_of_mount(mount)
+        self._own_mount = transform_of_mount(mount_of_lidar(self._robot.lidar))
         self._cameras = dict(cameras or {})
         self._filter = filter_ or CloudFilter(body_radius_m=self._robot.body_radius_m)
-        self._zero_means = zero_means
+        self._meanings = (zero_means, nan_means)
+        self._frames = RobotFrames(frames or FrameSettings(), policy.limits.max_age_s)
         self._faults: dict[str, str] = {}
+        self._left_out: str | None = None
         self._scan: Any = None
         self._clouds: dict[str, Any] = {}
         self._other_frames: list[str] = []
@@ -93,6 +127,33 @@ class Driver:
         """Take a ``nav_msgs/Odometry``."""
         self._odometry = message
 
+    def on_transforms(self, message: Any, *, static: bool = False) -> None:
+        """Take a ``tf2_msgs/TFMessage``; what cannot be read of it is left out, and told where it is missed.
+
+        Args:
+            message: of ``/tf``, or of ``/tf_static``.
+            static: whether it is of the latter.
+        """
+        self._left_out = None
+        for stamped in getattr(message, "transforms", [message]):
+            try:
+                self._frames.transforms.set(*messages.transform_of(stamped), static=static)
+            except UserInputError as error:
+                self._left_out = str(error)
+            except Exception as error:  # as in on_cloud()
+                self._left_out = described(error)
+
+    def on_pose(self, message: Any) -> None:
+        """Take a ``geometry_msgs/PoseWithCovarianceStamped`` of the robot."""
+        self._faults.pop("pose", None)
+        try:
+            pose, at_s = messages.pose_of(message), messages.stamp_s(message)
+            self._frames.localised(str(message.header.frame_id), at_s, pose)
+        except UserInputError as error:
+            self._faults["pose"] = f"the robot's pose cannot be read ({error})"
+        except Exception as error:  # as in on_cloud()
+            self._faults["pose"] = f"the robot's pose cannot be read ({described(error)})"
+
     def on_path(self, message: Any) -> None:
         """Take a ``nav_msgs/Path``; the goal is its last pose. One without poses means: stand."""
         self._faults.pop("path", None)
@@ -123,8 +184,12 @@ class Driver:
         Args:
             now_s: time of the clock that stamps the messages, s.
         """
+        self.situation = None
         try:
             return self._ask(now_s)
+        except TransformError as error:
+            left_out = "" if self._left_out is None else f"; of /tf was left out what cannot be read ({self._left_out})"
+            return self.policy.refuse(f"{error}{left_out}")
         except UserInputError as error:
             return self.policy.refuse(f"a message cannot be read ({error})")
         except Exception as error:  # as in on_cloud()
@@ -137,22 +202,27 @@ class Driver:
             return self.policy.refuse("there is no odometry yet")
         if self._no_path or self._follower is None:
             return self.policy.refuse(self._no_path)
-        frame = str(self._odometry.header.frame_id)
-        if frame != self._path_frame:
-            return self.policy.refuse(
-                f"the path is in frame {self._path_frame!r}, odometry in {frame!r}: send both in one"
-            )
-        pose, moved_s = messages.pose_of_odometry(self._odometry), messages.stamp_s(self._odometry)
-        self._poses.check(pose[:2], moved_s)
-        waypoints = self._follower.update(pose)
+        here, pose_s, moved_s = self._located(now_s)
+        waypoints = self._follower.update(here)
         if waypoints is None:
             return self.policy.refuse("the goal is reached")
         if (missing := self._missing()) is not None:
             return self.policy.refuse(missing)
-        ranges, scanned_s = self._ranges()
-        stamps = Stamps(now_s, scanned_s, moved_s, moved_s)
+        ranges, scanned_s = self._ranges(pose_s)
+        stamps = Stamps(now_s, scanned_s, pose_s, moved_s)
         velocity = messages.velocity_of_odometry(self._odometry)
+        self.situation = Situation(here, waypoints, ranges, velocity)
         return self.policy.act(ranges, waypoints, velocity, self.beta, stamps=stamps)
+
+    def _located(self, now_s: float) -> tuple[tuple[float, float, float], float, float]:
+        """Return the robot's pose in the path's frame, the stamp of that pose, and the stamp of the odometry."""
+        pose, moved_s = messages.pose_of_odometry(self._odometry), messages.stamp_s(self._odometry)
+        # Only odometry: what a localisation corrects is no motion.
+        self._poses.check(pose[:2], moved_s)
+        base_frame = str(getattr(self._odometry, "child_frame_id", ""))
+        self._frames.moved(str(self._odometry.header.frame_id), base_frame, moved_s, pose)
+        here, pose_s = self._frames.robot_in(self._path_frame, now_s)
+        return here, pose_s, moved_s
 
     def _missing(self) -> str | None:
         """Return what there is no message of yet, and what came instead."""
@@ -169,10 +239,21 @@ class Driver:
         frames = ", ".join(map(repr, missing))
         return f"there is no scan yet, or not of every camera: no cloud came in frame {frames}{others}"
 
-    def _ranges(self) -> tuple[Any, float]:
-        """Return what the sensors say and when: of several cameras, the oldest counts."""
+    def _ranges(self, pose_s: float) -> tuple[Scan | Sectors, float]:
+        """Return what the sensors say around where the robot was at a time, and when they saw it.
+
+        Of several cameras, the oldest counts.
+        """
         if not self._cameras:
-            return messages.scan_of(self._scan, self._mount, self._zero_means), messages.stamp_s(self._scan)
-        clouds = [(messages.points_of(self._clouds[frame]), pose) for frame, pose in self._cameras.items()]
-        oldest = min(messages.stamp_s(self._clouds[frame]) for frame in self._cameras)
-        return cloud_sectors(clouds, self._filter, self._robot.lidar.max_range_m), oldest
+            scanned_s = messages.stamp_s(self._scan)
+            frame = str(self._scan.header.frame_id)
+            there = self._frames.sensor(frame, scanned_s, pose_s, self._mount, self._own_mount)
+            return messages.scan_of(self._scan, mount_of(there), *self._meanings), scanned_s
+        clouds, stamps = [], []
+        for frame, camera in self._cameras.items():
+            message = self._clouds[frame]
+            stamps.append(messages.stamp_s(message))
+            given = transform_of_camera(camera) if isinstance(camera, CameraPose) else None
+            there = self._frames.sensor(frame, stamps[-1], pose_s, given)
+            clouds.append((messages.points_of(message), camera_of(there, camera, frame)))
+        return cloud_sectors(clouds, self._filter, self._robot.lidar.max_range_m), min(stamps)

@@ -27,20 +27,37 @@ _ZERO, _HALF = np.array(0.0, dtype=np.float32), np.array(0.5, dtype=np.float32)
 
 
 class Encoders:
-    """One observation and the memories before it to the memories after it, of all encoders of an agent at once.
+    """One observation and the states before it to the states after it, of all encoders of an agent at once.
+
+    A state begins with the memory that the heads read. With ``restart_steps`` another one follows that takes its place
+    in turn, and how many observations that one has read: so a memory has read about as many as in training, however
+    long the robot drives.
 
     Args:
         parts: tensors of each ``rcdsac_trl.agent.networks.Encoder``, by name; all of one shape.
         mask: the bins that the sensor has, bool [180]; the others are always 0.
         padding: how the convolutions read the ring of bins; see :mod:`rcdsac_trl.robot.ring`.
         range_code: how they read a bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
+        restart_steps: a state restarts every so many observations; None: never.
+
+    Attributes:
+        number: of encoders, E.
+        memory_size: numbers of a memory.
+        state_size: numbers of a state.
     """
 
     def __init__(
-        self, parts: Sequence[Tensors], mask: NDArray[np.bool_], padding: Padding, range_code: RangeCode
+        self,
+        parts: Sequence[Tensors],
+        mask: NDArray[np.bool_],
+        padding: Padding,
+        range_code: RangeCode,
+        restart_steps: int | None = None,
     ) -> None:
         self._reads_nearness = range_code == "nearness"
-        self.number, self.size = len(parts), parts[0]["gru.weight_hh_l0"].shape[1]
+        self._restart_steps = restart_steps
+        self.number, self.memory_size = len(parts), parts[0]["gru.weight_hh_l0"].shape[1]
+        self.state_size = self.memory_size if restart_steps is None else 2 * self.memory_size + 1
         self._convolve(parts, RING_ENDS[padding])
         self._select(parts, mask)
         self._vectors = _side_by_side(parts)
@@ -71,13 +88,13 @@ class Encoders:
         active = weight.reshape(len(parts), len(live), -1, weight.shape[2])[:, live]
         self._linear = active.reshape(len(parts), -1, weight.shape[2]), constant
 
-    def step(self, bins: Array, vectors: Array, memories: Array) -> Array:
-        """Return the next memories [E, memory].
+    def step(self, bins: Array, vectors: Array, states: Array) -> Array:
+        """Return the next states [E, state].
 
         Args:
             bins: range observation, [180].
             vectors: the vector observations, one behind the other, [k].
-            memories: [E, memory].
+            states: [E, state], zeros at the start.
         """
         if self._reads_nearness:
             bins = np.where(bins > _ZERO, np.float32(MAX_RANGE_OBSERVATION) - bins, _ZERO)
@@ -89,7 +106,16 @@ class Encoders:
         from_vectors += bias
         features = np.concatenate((from_range, from_vectors), axis=2)
         np.maximum(features, _ZERO, out=features)
-        return self._remember(features, memories[:, None])[:, 0]
+        if self._restart_steps is None:
+            return self._remember(features, states[:, None])[:, 0]
+        size, age = self.memory_size, states[0, -1]  # of all encoders alike
+        before = states[:, :-1].reshape(self.number, 2, size)
+        if age >= self._restart_steps:
+            before, age = np.stack((before[:, 1], np.zeros_like(before[:, 1])), axis=1), _ZERO
+        after = np.empty_like(states)
+        after[:, :-1] = self._remember(features, before).reshape(self.number, 2 * size)
+        after[:, -1] = age + 1
+        return after
 
     def _positions(self, bins: Array) -> Array:
         """Return what both convolutions make of the bins at the live positions, [E, positions, channels]."""
@@ -103,12 +129,12 @@ class Encoders:
         return np.maximum(second, _ZERO, out=second)
 
     def _remember(self, features: Array, before: Array) -> Array:
-        """Return the next memories; features, memories before and after are [E, 1, n]."""
+        """Return the next memories [E, m, memory], of features [E, 1, n] and the memories before [E, m, memory]."""
         weight_x, bias_x, weight_h, bias_h = self._gates
         inputs = features @ weight_x
         inputs += bias_x
         recurrent = before @ weight_h
-        size = self.size
+        size = self.memory_size
         gates = inputs[..., : 2 * size] + recurrent[..., : 2 * size]
         # The logistic function of twice that (see _recurrence), in a form that cannot overflow.
         np.tanh(gates, out=gates)

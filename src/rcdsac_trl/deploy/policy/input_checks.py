@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import masked, numbers_of
-from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, zero_readings
+from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, unsaid_readings
 from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MIN_RANGE_M, WAYPOINT_DISTANCE_LIMITS_M
@@ -203,11 +203,14 @@ def _check_lost(mask: NDArray[np.bool_], covered: NDArray[np.bool_], limits: Inp
     if lost <= limits.max_lost_share:
         return
     why = "is the sensor blind, or of another kind?"
-    if scan is not None and (zeros := zero_readings(scan)):
-        why = (
-            f"{zeros} of {np.size(scan.ranges)} rays read 0; if the driver writes 0 where nothing is, set "
-            "zero_means='nothing'"
-        )
+    if scan is not None:
+        option, number = max(unsaid_readings(scan).items(), key=lambda found: found[1])
+        if number:
+            read = "0" if option == "zero_means" else "NaN"
+            why = (
+                f"{number} of {np.size(scan.ranges)} rays read {read}; if the driver writes {read} where nothing is, "
+                f"set {option}=far; where something is too near, {option}=near"
+            )
     raise BadInputError(
         f"{100 * lost:.0f} % of the range bins this agent sees are not measured, more than "
         f"{100 * limits.max_lost_share:g} %: {why}"

@@ -54,7 +54,7 @@ def _memory_of(memory_s: float, sensed: NDArray[np.bool_], robot: RobotSettings)
         return None
     from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 
-    return RememberedRanges(sensed, memory_s, robot.lidar.max_range_m, robot.body_radius_m)
+    return RememberedRanges(sensed, memory_s, robot)
 
 
 def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> Guard | None:
@@ -120,12 +120,16 @@ class Policy:
         self._remembered = _memory_of(self.config.memory_s, self._mask, self.robot)
         parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
         self._encoders = Encoders(
-            [weights.part(f"{part}.encoder") for part in parts], self._mask, self.config.padding, self.config.range_code
+            [weights.part(f"{part}.encoder") for part in parts],
+            self._mask,
+            self.config.padding,
+            self.config.range_code,
+            self.config.restart_steps,
         )
         self._actor = Actor(weights)
         self._critics = Critics(weights, self.fractions)
         self._halted = False
-        self._memories: Array
+        self._states: Array
         self._steps: int
         self._commanded: tuple[float, float]
         self.reset()
@@ -290,7 +294,7 @@ class Policy:
             vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
         if config.context == "collision_weight" and context is not None:
             vectors.append(context)
-        self._memories = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._memories)
+        self._states = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._states)
         self._steps += 1
         outlook = self._outlook(self._embedded(context))
         self._wanted = outlook.wanted
@@ -303,9 +307,10 @@ class Policy:
         return self.config.embedding[0] * context + self.config.embedding[1]
 
     def _outlook(self, embedded: float | None, action: Array | None = None) -> Outlook:
+        memories = self._states[:, : self._encoders.memory_size]
         if action is None:
-            action = self._actor.action(self._memories[0], embedded)
-        lower = self._critics.values(self._memories[1:], action, embedded)
+            action = self._actor.action(memories[0], embedded)
+        lower = self._critics.values(memories[1:], action, embedded)
         quantiles = lower if self.config.critic == "quantile" else None
         told = lower.tolist()  # of so few, Python's sum is the fastest mean
         return Outlook(action, desired_velocities(action.tolist(), self.robot), quantiles, sum(told) / len(told))
@@ -355,7 +360,7 @@ class Policy:
         return float(value)
 
     def _forget(self) -> None:
-        self._memories = np.zeros((self._encoders.number, self._encoders.size), dtype=np.float32)
+        self._states = np.zeros((self._encoders.number, self._encoders.state_size), dtype=np.float32)
         if self._remembered is not None:
             self._remembered.reset()
         self._commanded = (0.0, 0.0)

@@ -30,9 +30,9 @@ from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 FORMAT_VERSION = 4
 """What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
 _UNSAID: dict[int, dict[str, Any]] = {
-    1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", "robot": PAPER},
-    2: {"memory_s": 0.0, "range_code": "paper", "robot": PAPER},
-    3: {"robot": PAPER},
+    1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", "restart_steps": None, "robot": PAPER},
+    2: {"memory_s": 0.0, "range_code": "paper", "restart_steps": None, "robot": PAPER},
+    3: {"restart_steps": None, "robot": PAPER},
     FORMAT_VERSION: {},
 }
 CONFIG_NAME = "config.json"
@@ -72,6 +72,8 @@ class AgentConfig:
         memory_s: for how long it is told of points that it saw, s; 0: not at all. See
             :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`.
         range_code: how its convolutions read a range bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
+        restart_steps: its recurrent states restart every so many observations; None: never. See
+            :class:`~rcdsac_trl.deploy.policy.inference.Encoders`.
         robot: that it was trained to drive; plain values of one, as files have them, are read.
 
     Raises:
@@ -95,6 +97,7 @@ class AgentConfig:
     padding: Padding = "circular"
     memory_s: float = 0.0
     range_code: RangeCode = "paper"
+    restart_steps: int | None = None
     robot: RobotSettings = PAPER
 
     def __post_init__(self) -> None:
@@ -124,6 +127,8 @@ class AgentConfig:
         check_memory(self.memory_s)
         if self.range_code not in get_args(RangeCode):
             raise UserInputError(f"range_code={self.range_code!r} is none of {', '.join(get_args(RangeCode))}")
+        if self.restart_steps is not None and (type(self.restart_steps) is not int or self.restart_steps < 1):
+            raise UserInputError(f"restart_steps={self.restart_steps} is neither a number of steps nor null")
         if self.critic not in ("quantile", "scalar"):
             raise UserInputError(f"critic={self.critic!r} is neither 'quantile' nor 'scalar'")
         if set(self.network) != set(_WIDTHS) or not all(type(w) is int and w >= 1 for w in self.network.values()):

@@ -8,7 +8,7 @@ plain CDR. The defaults are ROS's own: zeros, empty texts and lists, and a rotat
 from dataclasses import dataclass, field
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint32
+from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint8, uint32
 
 
 def _covariance() -> list[float]:
@@ -43,6 +43,20 @@ class Float64(IdlStruct, typename="std_msgs::msg::dds_::Float64_"):
     """``std_msgs/Float64``."""
 
     data: float64 = 0.0
+
+
+@dataclass
+class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
+    """``std_msgs/String``."""
+
+    data: str = ""
+
+
+@dataclass
+class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
+    """``rosgraph_msgs/Clock``."""
+
+    clock: Time = field(default_factory=Time)
 
 
 @dataclass
@@ -114,12 +128,44 @@ class PoseWithCovariance(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWith
 
 
 @dataclass
+class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"):
+    """``geometry_msgs/PoseWithCovarianceStamped``."""
+
+    header: Header = field(default_factory=Header)
+    pose: PoseWithCovariance = field(default_factory=PoseWithCovariance)
+
+
+@dataclass
 class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
     """``geometry_msgs/Vector3``."""
 
     x: float64 = 0.0
     y: float64 = 0.0
     z: float64 = 0.0
+
+
+@dataclass
+class Transform(IdlStruct, typename="geometry_msgs::msg::dds_::Transform_"):
+    """``geometry_msgs/Transform``."""
+
+    translation: Vector3 = field(default_factory=Vector3)
+    rotation: Quaternion = field(default_factory=Quaternion)
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformStamped_"):
+    """``geometry_msgs/TransformStamped``."""
+
+    header: Header = field(default_factory=Header)
+    child_frame_id: str = ""
+    transform: Transform = field(default_factory=Transform)
+
+
+@dataclass
+class TFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
+    """``tf2_msgs/TFMessage``."""
+
+    transforms: sequence[TransformStamped] = field(default_factory=list)
 
 
 @dataclass
@@ -178,3 +224,28 @@ class LaserScan(IdlStruct, typename="sensor_msgs::msg::dds_::LaserScan_"):
     range_max: float32 = 0.0
     ranges: sequence[float32] = field(default_factory=list)
     intensities: sequence[float32] = field(default_factory=list)
+
+
+@dataclass
+class PointField(IdlStruct, typename="sensor_msgs::msg::dds_::PointField_"):
+    """``sensor_msgs/PointField``."""
+
+    name: str = ""
+    offset: uint32 = 0
+    datatype: uint8 = 0
+    count: uint32 = 0
+
+
+@dataclass
+class PointCloud2(IdlStruct, typename="sensor_msgs::msg::dds_::PointCloud2_"):
+    """``sensor_msgs/PointCloud2``."""
+
+    header: Header = field(default_factory=Header)
+    height: uint32 = 0
+    width: uint32 = 0
+    fields: sequence[PointField] = field(default_factory=list)
+    is_bigendian: bool = False
+    point_step: uint32 = 0
+    row_step: uint32 = 0
+    data: sequence[uint8] = field(default_factory=list)
+    is_dense: bool = False

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
-from rcdsac_trl.deploy.sensors.scan import Scan, ZeroMeans
+from rcdsac_trl.deploy.sensors.scan import Meaning, Scan
 from rcdsac_trl.deploy.sensors.sectors import Mount, is_finite_number
 from rcdsac_trl.errors import UserInputError
 
@@ -31,19 +32,30 @@ def stamp_s(message: Any) -> float:
     Raises:
         UserInputError: if it does not hold less than a second of nanoseconds.
     """
-    stamp = message.header.stamp
+    return seconds_of(message.header.stamp)
+
+
+def seconds_of(stamp: Any) -> float:
+    """Return a ``builtin_interfaces/Time``, s.
+
+    Raises:
+        UserInputError: if it does not hold less than a second of nanoseconds.
+    """
     if not 0 <= stamp.nanosec < 1_000_000_000:
         raise UserInputError(f"a stamp's nanosec={stamp.nanosec} is not from 0 to 999999999: put seconds into sec")
     return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
 
 
-def scan_of(message: Any, mount: Mount | None = None, zero_means: ZeroMeans = "unknown") -> Scan:
+def scan_of(
+    message: Any, mount: Mount | None = None, zero_means: Meaning = "invalid", nan_means: Meaning = "invalid"
+) -> Scan:
     """Return the scan in a ``sensor_msgs/LaserScan``.
 
     Args:
         message: the message.
         mount: where the sensor sits, from the static transform to its frame; None for the robot's centre.
         zero_means: what its driver means by a reading of 0.
+        nan_means: what it means by NaN.
 
     Raises:
         UserInputError: if its ranges are no numbers, or its angles do not fit to their number.
@@ -58,6 +70,7 @@ def scan_of(message: Any, mount: Mount | None = None, zero_means: ZeroMeans = "u
         range_max=float(message.range_max),
         mount=mount or Mount(),
         zero_means=zero_means,
+        nan_means=nan_means,
     )
 
 
@@ -118,8 +131,31 @@ def pose_of_odometry(message: Any) -> tuple[float, float, float]:
     Raises:
         UserInputError: if the orientation is no rotation.
     """
+    return pose_of(message)
+
+
+def pose_of(message: Any) -> tuple[float, float, float]:
+    """Return x and y in m and yaw in rad of a ``geometry_msgs/PoseWithCovarianceStamped``, in its header's frame.
+
+    Raises:
+        UserInputError: if the orientation is no rotation.
+    """
     pose = message.pose.pose
     return float(pose.position.x), float(pose.position.y), _yaw(pose.orientation)
+
+
+def transform_of(message: Any) -> tuple[str, str, float, RigidTransform]:
+    """Return parent, child, stamp in s and transform of a ``geometry_msgs/TransformStamped``.
+
+    Raises:
+        UserInputError: if the transform is none.
+    """
+    place, turn = message.transform.translation, message.transform.rotation
+    transform = RigidTransform(
+        (float(place.x), float(place.y), float(place.z)),
+        (float(turn.x), float(turn.y), float(turn.z), float(turn.w)),
+    )
+    return str(message.header.frame_id), str(message.child_frame_id), stamp_s(message), transform
 
 
 def path_of(message: Any) -> NDArray[np.float64]:

@@ -3,7 +3,13 @@
 Types are named as ROS 2 names them, such as ``"geometry_msgs/msg/Twist"``.
 """
 
+import re
 from collections.abc import Sequence
+
+DRIVING = "driving"
+"""What ``drive_status`` says where there is nothing else to say."""
+
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 def writers_of(topic: str, kind: str, writers: Sequence[str], *, matched: bool = True) -> str | None:
@@ -44,6 +50,16 @@ def readers_of(topic: str, kinds: Sequence[str], readers: Sequence[str]) -> str:
         return f"nobody reads {topic} (written as {_listed(kinds)})"
     said = f"{topic} is read as {_listed(readers)}"
     return said if set(readers) <= set(kinds) else f"{said}, and written as {_listed(kinds)}"
+
+
+def without_numbers(reason: str | None) -> str | None:
+    """Return what kind of reason it is: one that only counts on is not told again.
+
+    Example:
+        >>> without_numbers("stamp scan_s is 0.40 s old") == without_numbers("stamp scan_s is 0.54 s old")
+        True
+    """
+    return None if reason is None else _NUMBER.sub("", reason)
 
 
 def _listed(kinds: Sequence[str]) -> str:

@@ -8,7 +8,8 @@ What a ray's number means (REP 117, and what drivers do in spite of it):
 | +Inf, or beyond range_max | nothing is there |
 | -Inf | something is there, nearer than range_min: it counts as range_min |
 | NaN, 0, or otherwise below range_min | no measurement: the ray says nothing |
-| 0, with ``zero_means="nothing"`` | nothing is there: so do some cheap scanners say it |
+| 0 with ``zero_means="far"``, NaN with ``nan_means="far"`` | nothing is there: so do some cheap scanners say it |
+| the same with ``"near"`` | something is there, nearer than range_min: it counts as range_min |
 
 Since beyond range_max is nothing, a scan in millimetres would read as open space: it is refused before.
 """
@@ -46,8 +47,11 @@ _BEYOND, _FAR_BEYOND = 2.0, 1000.0
 # The last numbers of 16 bits, in millimetres: so many drivers write that nothing is there.
 _LAST_OF_16_BITS_M = (65.5325, 65.5355)
 
-ZeroMeans = Literal["unknown", "nothing"]
-"""What a reading of 0 means."""
+Meaning = Literal["invalid", "far", "near"]
+"""What a driver means by a reading that is no distance: no measurement, nothing there, something before range_min."""
+
+
+_STANDS_FOR: dict[Meaning, float] = {"invalid": math.nan, "far": math.inf, "near": -math.inf}
 
 
 @dataclass(frozen=True)
@@ -61,8 +65,10 @@ class Scan:
         range_min: smallest distance that the sensor measures, m.
         range_max: largest one, m; may be ``inf``.
         mount: where the sensor sits.
-        zero_means: what the driver means by a reading of 0: ``"unknown"``, or ``"nothing"`` if it writes 0 where
-            nothing is. With the latter a sensor that fails with zeros reads as open space.
+        zero_means: what the driver means by a reading of 0: ``"invalid"``, ``"far"`` if it writes 0 where nothing is,
+            or ``"near"`` if it does where something is too near. With ``"far"`` a sensor that fails with zeros reads
+            as open space.
+        nan_means: the same of NaN.
     """
 
     ranges: ArrayLike
@@ -71,17 +77,18 @@ class Scan:
     range_min: float
     range_max: float
     mount: Mount = field(default_factory=Mount)
-    zero_means: ZeroMeans = "unknown"
+    zero_means: Meaning = "invalid"
+    nan_means: Meaning = "invalid"
 
 
-def check_zero_means(value: object) -> None:
-    """Refuse what zeros cannot mean.
+def check_meaning(name: str, value: object) -> None:
+    """Refuse what readings cannot mean.
 
     Raises:
         UserInputError: with what they can.
     """
-    if value not in get_args(ZeroMeans):
-        raise UserInputError(f"zero_means={value!r} is neither 'unknown' nor 'nothing': choose one")
+    if value not in get_args(Meaning):
+        raise UserInputError(f"{name}={value!r} is none of {', '.join(get_args(Meaning))}: choose one")
 
 
 def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_m: float = MAX_RANGE_M) -> Sectors:
@@ -108,11 +115,10 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_
     """
     ranges = _checked(scan, max_range_m)
     with np.errstate(invalid="ignore"):
+        for readings, meaning in ((ranges == 0.0, scan.zero_means), (np.isnan(ranges), scan.nan_means)):
+            ranges = np.where(readings, _STANDS_FOR[meaning], ranges)
         too_near = np.isneginf(ranges)
         silent = np.isnan(ranges) | (ranges < scan.range_min) & ~too_near
-        if scan.zero_means == "nothing":
-            silent &= ranges != 0.0
-            ranges = np.where(ranges == 0.0, np.inf, ranges)
         ranges = np.where(ranges > scan.range_max, np.inf, ranges)
         ranges[too_near] = scan.range_min
     mount = scan.mount
@@ -133,9 +139,14 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_
     return Sectors(nearest, covered | np.isfinite(nearest), max_range_m)
 
 
-def zero_readings(scan: Scan) -> int:
-    """Return how many rays of a scan read 0 and say nothing by it."""
-    return 0 if scan.zero_means == "nothing" else int(np.count_nonzero(numbers_of(scan.ranges, "ranges") == 0.0))
+def unsaid_readings(scan: Scan) -> dict[str, int]:
+    """Return how many rays of a scan read 0, and how many NaN, where nobody said what is meant by it."""
+    ranges = numbers_of(scan.ranges, "ranges")
+    zeros, nans = np.count_nonzero(ranges == 0.0), np.count_nonzero(np.isnan(ranges))
+    return {
+        "zero_means": int(zeros) if scan.zero_means == "invalid" else 0,
+        "nan_means": int(nans) if scan.nan_means == "invalid" else 0,
+    }
 
 
 def _checked(scan: Scan, max_range_m: float) -> NDArray[np.float64]:
@@ -144,7 +155,8 @@ def _checked(scan: Scan, max_range_m: float) -> NDArray[np.float64]:
         raise UserInputError(f"the scan's ranges have shape {list(ranges.shape)}: give one number for each ray")
     if not isinstance(scan.mount, Mount):
         raise UserInputError(f"the scan's mount is a {type(scan.mount).__name__}: give a Mount")
-    check_zero_means(scan.zero_means)
+    check_meaning("zero_means", scan.zero_means)
+    check_meaning("nan_means", scan.nan_means)
     _check_angles(scan, len(ranges))
     _check_limits(scan, max_range_m)
     _check_unit(ranges, scan)

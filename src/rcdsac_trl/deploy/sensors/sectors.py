@@ -68,7 +68,7 @@ class Mount:
             raise UserInputError(f"yaw_rad={self.yaw_rad:g} of a sensor is more than a full turn: give radians")
 
 
-def mount_of(lidar: LidarSettings) -> Mount:
+def mount_of_lidar(lidar: LidarSettings) -> Mount:
     """Return where a robot's own sensor sits."""
     return Mount(lidar.x_m, lidar.y_m, math.radians(lidar.yaw_deg))
 

@@ -7,6 +7,7 @@ planned path finds a way past it without planning anew.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,17 @@ Piece = Box | Cylinder
 class ClutterSite:
     """A building and the pieces that have been put into it so far."""
 
-    def __init__(self, walls: list[Box], size_m: float, clearance_m: float, detour_m: float) -> None:
+    def __init__(
+        self,
+        walls: list[Box],
+        size_m: float,
+        clearance_m: float,
+        detour_m: float,
+        *,
+        standing: Sequence[Cylinder] = (),
+        floor: NDArray[np.bool_] | None = None,
+        kept_free: Sequence[tuple[float, float]] = (),
+    ) -> None:
         """Begin with the empty building.
 
         Args:
@@ -36,13 +47,18 @@ class ClutterSite:
             size_m: side of the square map, m.
             clearance_m: robot radius plus margin, m.
             detour_m: how far around the places that an unmapped piece takes a way past it may lead, m.
+            standing: what else stands in it from the beginning.
+            floor: cells [rows, columns] that pieces may have their centre in; None: all.
+            kept_free: places that keep the clearance from every piece, m.
         """
         self.pieces: list[Piece] = []
         self._walls = walls
+        self._floor = None if floor is None else np.argwhere(floor)
+        self._kept_free = kept_free
         self._size_m = size_m
         self._clearance_m = clearance_m
         self._detour_m = detour_m
-        self._boxes, self._circles = solid_arrays(walls)
+        self._boxes, self._circles = solid_arrays([*walls, *standing])
         side = round(size_m / CELL_M)
         self._field = np.full((side, side), np.inf)
         lower_clearance(self._field, self._boxes, self._circles, clearance_m, CELL_M)
@@ -65,6 +81,9 @@ class ClutterSite:
         if not inside or self._overlaps(piece):
             return False
         boxes, circles = solid_arrays([piece])
+        need_m = self._clearance_m
+        if any(segment_clearance(x, y, x, y, boxes, circles, need_m) < need_m for x, y in self._kept_free):
+            return False
         near_m = _bounding_radius(piece) + self._clearance_m + (0.0 if piece.mapped else self._detour_m)
         window = self._window(piece, near_m + 2 * CELL_M)
         field = self._field.copy()
@@ -111,13 +130,21 @@ class ClutterSite:
             beside = self.pieces[rng.integers(len(self.pieces))]
             x, y = rng.normal((beside.x, beside.y), _GROUP_M).tolist()
         else:
-            x, y = rng.uniform(0.0, self._size_m, 2).tolist()
+            x, y = self._anywhere(rng)
         if kind == 1:
             half_x, half_y = rng.uniform(0.15, 0.45, 2).tolist()
             # People put about half of their crates down square to the walls.
             yaw = float(rng.uniform(0.0, math.pi)) if rng.random() < 0.5 else 0.0
             return Box(x, y, half_x, half_y, yaw, mapped)
         return Cylinder(x, y, float(rng.uniform(*((0.06, 0.15) if kind == 2 else (0.2, 0.4)))), mapped)
+
+    def _anywhere(self, rng: np.random.Generator) -> tuple[float, float]:
+        if self._floor is None:
+            x, y = rng.uniform(0.0, self._size_m, 2).tolist()
+        else:
+            row, column = self._floor[rng.integers(len(self._floor))]
+            x, y = (CELL_M * (np.array([column, row]) + rng.random(2))).tolist()
+        return x, y
 
 
 def _shelf(walls: list[Box], mapped: bool, rng: np.random.Generator) -> Box:

@@ -7,7 +7,6 @@ know there is a way past it nearby.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,6 +17,7 @@ from rcdsac_trl.world.maps.clutter import ClutterSite
 from rcdsac_trl.world.maps.geometry import CELL_M, ROBOT_RADIUS_M
 from rcdsac_trl.world.maps.grid_search import label_components
 from rcdsac_trl.world.maps.layouts import build_walls
+from rcdsac_trl.world.maps.map_checks import check_number, check_range, check_whole
 from rcdsac_trl.world.maps.shapes import CLEARANCE_MARGIN_M, WAYPOINT_CLEARANCE_M, Box, Cylinder, Map, Mover
 
 __all__ = ["LAYOUTS", "SPLITS", "Box", "Cylinder", "Map", "MapSettings", "Mover", "Split", "generate_map"]
@@ -89,18 +89,18 @@ class MapSettings:
         unknown = [name for name in self.layouts if name not in LAYOUTS]
         if unknown or not self.layouts:
             raise UserInputError(f"layouts is {list(self.layouts)} but must name at least one of {', '.join(LAYOUTS)}")
-        _check_int("num_movers", self.num_movers, 0, 50)
-        _check("size_m", self.size_m, 10.0, 60.0)
-        _check("clutter_per_m2", self.clutter_per_m2, 0.0, 1.0)
-        _check("mapped_fraction", self.mapped_fraction, 0.0, 1.0)
-        _check("clearance_margin_m", self.clearance_margin_m, 0.02, 0.2)
-        _check("waypoint_clearance_m", self.waypoint_clearance_m, 0.0, 2.0)
-        _check("detour_m", self.detour_m, 0.2, 3.0)
+        check_whole("num_movers", self.num_movers, 0, 50)
+        check_number("size_m", self.size_m, 10.0, 60.0)
+        check_number("clutter_per_m2", self.clutter_per_m2, 0.0, 1.0)
+        check_number("mapped_fraction", self.mapped_fraction, 0.0, 1.0)
+        check_number("clearance_margin_m", self.clearance_margin_m, 0.02, 0.2)
+        check_number("waypoint_clearance_m", self.waypoint_clearance_m, 0.0, 2.0)
+        check_number("detour_m", self.detour_m, 0.2, 3.0)
         passage_m = _passage_m(ROBOT_RADIUS_M, self.clearance_margin_m)
-        _check_range("corridor_width_m", self.corridor_width_m, passage_m, 5.0)
-        _check_range("door_width_m", self.door_width_m, passage_m, 2.0)
-        _check_range("mover_radius_m", self.mover_radius_m, 0.05, 0.4)
-        _check_range("mover_speed_m_per_s", self.mover_speed_m_per_s, 0.05, 2.0)
+        check_range("corridor_width_m", self.corridor_width_m, passage_m, 5.0)
+        check_range("door_width_m", self.door_width_m, passage_m, 2.0)
+        check_range("mover_radius_m", self.mover_radius_m, 0.05, 0.4)
+        check_range("mover_speed_m_per_s", self.mover_speed_m_per_s, 0.05, 2.0)
 
 
 def _passage_m(robot_radius_m: float, margin_m: float) -> float:
@@ -193,24 +193,3 @@ def _connected_building(
         f"no connected building of layout {layout!r} was found in {_MAX_BUILDINGS} tries; "
         "lower door_width_m or raise size_m"
     )
-
-
-def _check(name: str, value: object, low: float, high: float) -> None:
-    # Written so that NaN fails too.
-    if isinstance(value, bool) or not isinstance(value, Real) or not low <= float(value) <= high:
-        raise UserInputError(f"{name} is {value!r} but must be a number from {low:g} to {high:g}")
-
-
-def _check_int(name: str, value: object, low: int, high: int) -> None:
-    _check(name, value, low, high)
-    if not isinstance(value, int):
-        raise UserInputError(f"{name} is {value!r} but must be a whole number from {low} to {high}")
-
-
-def _check_range(name: str, value: tuple[float, ...], low: float, high: float) -> None:
-    if len(value) != 2:
-        raise UserInputError(f"{name} is {list(value)} but must be two numbers, smallest and largest")
-    for end in value:
-        _check(name, end, low, high)
-    if value[0] > value[1]:
-        raise UserInputError(f"{name} is {list(value)} but its smallest value must not exceed its largest")

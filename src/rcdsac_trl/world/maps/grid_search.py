@@ -178,3 +178,39 @@ def cheapest_path(free: NDArray[np.bool_], weight: NDArray[np.float64], start: i
         path[i] = node
         node = parent[node]
     return path
+
+
+@njit
+def farthest_cell(free: NDArray[np.bool_], start: int) -> tuple[int, float]:
+    """Return the cell that is farthest from another one, by steps over free cells, and how far, in cells.
+
+    Args:
+        free: bool [rows, columns].
+        start: flat index of a free cell.
+    """
+    rows, columns = free.shape
+    cost = np.full(rows * columns, np.inf)
+    heap_costs = np.empty(rows * columns + 8, np.float64)
+    heap_nodes = np.empty(rows * columns + 8, np.int32)
+    cost[start] = 0.0
+    _push(heap_costs, heap_nodes, 0, 0.0, start)
+    size, farthest, most = 1, start, 0.0
+    while size > 0:
+        at = heap_costs[0]
+        node = _pop(heap_costs, heap_nodes, size)
+        size -= 1
+        if at > cost[node]:
+            continue
+        farthest, most = node, at  # cells come in the order of their distance
+        if size + 8 > heap_costs.size:
+            heap_costs = np.concatenate((heap_costs, np.empty_like(heap_costs)))
+            heap_nodes = np.concatenate((heap_nodes, np.empty_like(heap_nodes)))
+        row, column = node // columns, node % columns
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(column - 1, 0), min(column + 2, columns)):
+                new = at + (_SQRT2 if r != row and c != column else 1.0)
+                if free[r, c] and new < cost[r * columns + c]:
+                    cost[r * columns + c] = new
+                    _push(heap_costs, heap_nodes, size, new, r * columns + c)
+                    size += 1
+    return farthest, most

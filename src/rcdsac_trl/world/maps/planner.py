@@ -58,6 +58,7 @@ class _Layer:
         self.side = round(map.size_m / CELL_M)
         field = np.full((self.side, self.side), comfort_m)
         lower_clearance(field, self.boxes, self.circles, comfort_m, CELL_M)
+        self.field = field
         self.free = field >= clearance_m
         self.weight = np.ones_like(field)
         if comfort_m > clearance_m:
@@ -106,7 +107,9 @@ class _Layer:
         only to come no nearer than it already is.
         """
         first_m = min(self.leg_m, self.clearance(points[0], points[0]) - _ROUNDING_M)
-        return points[pull_tight(points, self.boxes, self.circles, self.weight, first_m, self.leg_m, CELL_M)]
+        return points[
+            pull_tight(points, self.boxes, self.circles, self.field, self.weight, first_m, self.leg_m, CELL_M)
+        ]
 
     def path(self, start: Point, goal: Point) -> NDArray[np.float64]:
         """Return the corners of the cheapest path from start to goal."""

@@ -1,14 +1,15 @@
 """A map as a plain value: what stands where, and what moves.
 
 The map frame has its origin in the lower left corner, x to the right, y up, so everything lies in
-``[0, size_m] x [0, size_m]``. A map says nothing of a robot: starts, goals and the movers' walks are drawn
-per episode by whoever needs them.
+``[0, size_m] x [0, size_m]``. A map says little of a robot: starts, goals and the movers' walks are drawn
+per episode by whoever needs them, but for a start and a goal that somebody chose.
 """
 
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -25,9 +26,8 @@ WAYPOINT_CLEARANCE_M = 0.6
 FORMAT_VERSION = 1
 """Version of the JSON that :meth:`Map.to_json` writes."""
 
-
-# Larger ones the planner's grid could not hold.
-_MAX_SIZE_M = 200.0
+MAX_SIZE_M = 200.0
+"""Largest side of a map: a larger one the planner's grid could not hold, m."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,14 @@ class Mover:
     speed_m_per_s: float
 
 
+def _sides(boxes: Sequence[Box]) -> NDArray[np.float64]:
+    """Return the sides of boxes, float64 [n, 4]: x0, y0, x1, y1 in m."""
+    if not boxes:
+        return np.empty((0, 4))
+    corners = np.stack([box.corners() for box in boxes])
+    return np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 4)
+
+
 Kind = Literal["outer_wall", "inner_wall", "mapped_clutter", "unmapped_clutter"]
 """What something that stands is; see :meth:`Map.kind`."""
 
@@ -108,6 +116,8 @@ class Map:
         movers: what walks about.
         clearance_margin_m: beyond the robot's radius, the clearance at which the free space is connected.
         waypoint_clearance_m: the clearance that waypoints keep where that costs little.
+        start: where a robot starts, x, y in m and yaw in rad; None: drawn an episode.
+        goal: its first goal, m; None: drawn likewise, as all that follow.
 
     Example:
         >>> crate = Box(x=1.0, y=2.0, half_x=0.5, half_y=0.25, yaw=0.0, mapped=True)
@@ -123,6 +133,8 @@ class Map:
     movers: tuple[Mover, ...]
     clearance_margin_m: float = CLEARANCE_MARGIN_M
     waypoint_clearance_m: float = WAYPOINT_CLEARANCE_M
+    start: tuple[float, float, float] | None = None
+    goal: tuple[float, float] | None = None
 
     def segments(self, mapped_only: bool = False) -> NDArray[np.float64]:
         """Return the sides of the boxes as float64 [n, 4]: x0, y0, x1, y1 in m.
@@ -130,11 +142,12 @@ class Map:
         Args:
             mapped_only: leave out what the planner does not know.
         """
-        boxes = [box for box in self.boxes if box.mapped or not mapped_only]
-        if not boxes:
-            return np.empty((0, 4))
-        corners = np.stack([box.corners() for box in boxes])
-        return np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 4)
+        return _sides([box for box in self.boxes if box.mapped]) if mapped_only else self._all_sides
+
+    @cached_property
+    def _all_sides(self) -> NDArray[np.float64]:
+        """The sides of all boxes: every simulation of the map asks for them."""
+        return _sides(self.boxes)
 
     def circles(self, mapped_only: bool = False) -> NDArray[np.float64]:
         """Return the cylinders as float64 [m, 3]: x, y, radius in m.
@@ -172,7 +185,11 @@ class Map:
 
     def to_json(self) -> str:
         """Return the map as JSON; :meth:`from_json` gives an equal map back, bit for bit."""
-        return json.dumps({"format": FORMAT_VERSION, **asdict(self)})
+        values = asdict(self)
+        for name in ("start", "goal"):  # as maps without them always were
+            if values[name] is None:
+                del values[name]
+        return json.dumps({"format": FORMAT_VERSION, **values})
 
     @classmethod
     def from_json(cls, text: str) -> "Map":
@@ -182,26 +199,46 @@ class Map:
             UserInputError: the text is not such a map.
         """
         try:
-            data: dict[str, Any] = json.loads(text)
-            version = data.pop("format")
-            if version != FORMAT_VERSION:
-                raise ValueError(f"its format is {version!r}, only {FORMAT_VERSION} can be read")
-            for key, part in (("boxes", Box), ("cylinders", Cylinder), ("movers", Mover)):
-                data[key] = tuple(part(**item) for item in data[key])
-            map_ = cls(**data)
-            _check_read(map_)
-            return map_
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            return map_of_values(json.loads(text))
+        except _NO_MAP as error:
             raise UserInputError(f"the text is not a map ({error}); give what Map.to_json wrote") from error
+
+
+_NO_MAP = (ValueError, TypeError, KeyError, AttributeError, RecursionError)
+
+
+def map_of_values(values: dict[str, Any]) -> Map:
+    """Return the map of values as JSON has them.
+
+    Raises:
+        ValueError: for whatever no map has; so do TypeError, KeyError and AttributeError.
+    """
+    data = dict(values)
+    version = data.pop("format")
+    if version != FORMAT_VERSION:
+        raise ValueError(f"its format is {version!r}, only {FORMAT_VERSION} can be read")
+    for key, part in (("boxes", Box), ("cylinders", Cylinder), ("movers", Mover)):
+        data[key] = tuple(part(**item) for item in data[key])
+    for key in ("start", "goal"):
+        if data.get(key) is not None:
+            data[key] = tuple(data[key])
+    map_ = Map(**data)
+    _check_read(map_)
+    return map_
 
 
 def _check_read(map_: Map) -> None:
     """Refuse values that no map has, with a ValueError."""
     if not isinstance(map_.layout, str):
         raise ValueError(f"layout is {map_.layout!r}, not text")
-    _check_number("size_m", map_.size_m, 1.0, _MAX_SIZE_M)
+    _check_number("size_m", map_.size_m, 1.0, MAX_SIZE_M)
     for name in ("clearance_margin_m", "waypoint_clearance_m"):
         _check_number(name, getattr(map_, name), 0.0, map_.size_m)
+    for name, place, numbers in (("start", map_.start, 3), ("goal", map_.goal, 2)):
+        if place is not None and len(place) != numbers:
+            raise ValueError(f"{name} is {list(place)}, not {numbers} numbers")
+        for value in place or ():
+            _check_number(name, value, -MAX_SIZE_M, MAX_SIZE_M)
     parts: list[tuple[str, Box | Cylinder | Mover]] = [
         *(("boxes", box) for box in map_.boxes),
         *(("cylinders", cylinder) for cylinder in map_.cylinders),

@@ -3,16 +3,25 @@
 Each takes the number of a visual shape, -1 for the one that PyBullet makes of the collision shapes.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.world.maps.generator import Box, Cylinder, Map
+from rcdsac_trl.world.maps.shapes import solid_arrays
 from rcdsac_trl.world.sim.bullet import pybullet
 
 SHAPES_PER_BODY = 16
 """Static shapes are joined to compound bodies of up to so many: a body each makes a step 8 times as slow."""
+MAX_WHOLE_SHAPES = 512
+"""A map of up to so many static shapes exists as a whole."""
 
+# Of a larger map exists what is within so much of the square that the robot is in; it leaves it by 0.2 m at most before
+# anybody looks again.
+_SQUARE_M = 4.0
+_AROUND_M = 1.0
 # Velocities are set, and nothing else that moves can be pushed: only the ratio of inertia to mass counts.
 _ROBOT_MASS_KG = 10.0
 _ROBOT_HALF_HEIGHT_M = 0.1
@@ -31,11 +40,55 @@ def invisible_shape(client: int) -> int:
     return shape
 
 
-def add_static(client: int, map: Map, visual: int) -> None:
-    """Add walls and clutter as few compound bodies of shapes that lie near each other."""
-    shapes: list[Box | Cylinder] = [*map.boxes, *map.cylinders]
-    for first in range(0, len(shapes), SHAPES_PER_BODY):
-        group = shapes[first : first + SHAPES_PER_BODY]
+class StaticBodies:
+    """Walls and clutter as few compound bodies of shapes that lie near each other.
+
+    They are plain rigid bodies ("maximal coordinates"): what stands has no joints, and a step does not visit each of
+    them as it would a multibody. Of a large map only those near the robot exist, since a step visits every body.
+    Contact is bit for bit the same either way.
+
+    Args:
+        client: PyBullet's.
+        map: what stands.
+        visual: number of a visual shape, -1 for the one that PyBullet makes.
+        whole: let all exist, wherever the robot is; None: if they are few.
+    """
+
+    def __init__(self, client: int, map: Map, visual: int, whole: bool | None = None) -> None:
+        self._client, self._visual = client, visual
+        shapes: list[Box | Cylinder] = [*map.boxes, *map.cylinders]
+        whole = len(shapes) <= MAX_WHOLE_SHAPES if whole is None else whole
+        firsts = range(0, len(shapes), SHAPES_PER_BODY)
+        self._groups = [shapes[first : first + SHAPES_PER_BODY] for first in firsts]
+        self._bodies: dict[int, int] = {}  # of the groups that exist
+        self._square: tuple[int, int] | None = None
+        self._bounds = None if whole else np.array([_bounds(group) for group in self._groups])
+        if whole:
+            for number in range(len(self._groups)):
+                self._add(number)
+
+    def follow(self, x: float, y: float) -> None:
+        """Let what is near a robot exist, and nothing else.
+
+        Args:
+            x: where the robot is, m.
+            y: likewise.
+        """
+        square = math.floor(x / _SQUARE_M), math.floor(y / _SQUARE_M)
+        if self._bounds is None or square == self._square:
+            return
+        self._square = square
+        low = _SQUARE_M * np.array(square) - _AROUND_M
+        high = low + _SQUARE_M + 2 * _AROUND_M
+        near = (self._bounds[:, :2] <= high).all(axis=1) & (self._bounds[:, 2:] >= low).all(axis=1)
+        wanted = set(np.flatnonzero(near).tolist())
+        for number in sorted(self._bodies.keys() - wanted):
+            pybullet.removeBody(self._bodies.pop(number), physicsClientId=self._client)
+        for number in sorted(wanted - self._bodies.keys()):
+            self._add(number)
+
+    def _add(self, number: int) -> None:
+        group = self._groups[number]
         boxes = [isinstance(shape, Box) for shape in group]
         shape = pybullet.createCollisionShapeArray(
             shapeTypes=[pybullet.GEOM_BOX if box else pybullet.GEOM_CYLINDER for box in boxes],
@@ -48,9 +101,21 @@ def add_static(client: int, map: Map, visual: int) -> None:
             collisionFrameOrientations=[
                 pybullet.getQuaternionFromEuler((0.0, 0.0, s.yaw if isinstance(s, Box) else 0.0)) for s in group
             ],
-            physicsClientId=client,
+            physicsClientId=self._client,
         )
-        pybullet.createMultiBody(0.0, shape, visual, physicsClientId=client)
+        self._bodies[number] = pybullet.createMultiBody(
+            0.0, shape, self._visual, useMaximalCoordinates=1, physicsClientId=self._client
+        )
+
+
+def _bounds(shapes: list[Box | Cylinder]) -> list[float]:
+    """Return smallest x and y and largest x and y of shapes, m."""
+    boxes, circles = solid_arrays(shapes)
+    turns = np.abs(boxes[:, 4:])  # |cos|, |sin|
+    halves = np.stack([(turns * boxes[:, 2:4]).sum(axis=1), (turns * boxes[:, 3:1:-1]).sum(axis=1)], axis=1)
+    low = np.concatenate([boxes[:, :2] - halves, circles[:, :2] - circles[:, 2:]])
+    high = np.concatenate([boxes[:, :2] + halves, circles[:, :2] + circles[:, 2:]])
+    return [*low.min(axis=0).tolist(), *high.max(axis=0).tolist()]
 
 
 def add_robot(client: int, start_pose: tuple[float, float, float], visual: int, robot: RobotSettings) -> int:

@@ -13,6 +13,9 @@ import numpy as np
 from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 from rcdsac_trl.system.jit import njit
 
+TILE_M = 2.0
+"""Side of the squares of :class:`NearSegments`, m."""
+
 # Directions of the borders between the bins; border b is where bin b (from 0) begins.
 _BORDER_COS = np.cos(np.arange(NUM_BINS) * BIN_RAD)
 _BORDER_SIN = np.sin(np.arange(NUM_BINS) * BIN_RAD)
@@ -183,3 +186,40 @@ def sector_distances(
     distances = np.empty(NUM_BINS)
     scan(distances, x, y, yaw, segments, circles, max_range_m)
     return distances
+
+
+class NearSegments:
+    """The segments of a map, by place: what can be within range from a square of the floor is picked out once.
+
+    A scan of what :meth:`near` returns is bit for bit the scan of all segments, since a sector's distance is a minimum
+    in which what is out of range has no part.
+
+    Args:
+        segments: float64 [n, 4], each row the ends (x0, y0, x1, y1), m.
+        max_range_m: of the scans.
+
+    Example:
+        >>> walls = NearSegments(np.array([[2.0, -1.0, 2.0, 1.0], [40.0, -1.0, 40.0, 1.0]]))
+        >>> walls.near(0.0, 0.0).tolist()
+        [[2.0, -1.0, 2.0, 1.0]]
+    """
+
+    def __init__(self, segments: np.ndarray, max_range_m: float = MAX_RANGE_M) -> None:
+        self._segments = np.ascontiguousarray(segments, dtype=np.float64)
+        ends = self._segments.reshape(-1, 2, 2)
+        self._low, self._high = ends.min(axis=1) - max_range_m, ends.max(axis=1) + max_range_m
+        self._tiles: dict[tuple[int, int], np.ndarray] = {}
+
+    def near(self, x: float, y: float) -> np.ndarray:
+        """Return all segments that can be within range of a point, in their order, float64 [k, 4].
+
+        Args:
+            x: of the point, m.
+            y: likewise.
+        """
+        tile = math.floor(x / TILE_M), math.floor(y / TILE_M)
+        if tile not in self._tiles:
+            corner = TILE_M * np.array(tile)
+            within = (self._low <= corner + TILE_M).all(axis=1) & (self._high >= corner).all(axis=1)
+            self._tiles[tile] = self._segments[within]
+        return self._tiles[tile]

@@ -22,7 +22,7 @@ from rcdsac_trl.world.maps.generator import Map
 from rcdsac_trl.world.maps.geometry import outline_clearance, segment_clearance
 from rcdsac_trl.world.sim import bodies
 from rcdsac_trl.world.sim.bullet import Client, check_display, pybullet
-from rcdsac_trl.world.sim.lidar import scan
+from rcdsac_trl.world.sim.lidar import NearSegments, scan
 from rcdsac_trl.world.sim.movers import Movers, WalkPlanner
 
 SIMULATION_BYTES = 28_000_000
@@ -160,7 +160,8 @@ class Simulation:
         )
         pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
         visual = -1 if self._gui else bodies.invisible_shape(client)
-        bodies.add_static(client, map, visual)
+        self._static = bodies.StaticBodies(client, map, visual, whole=True if self._gui else None)
+        self._static.follow(*start_pose[:2])
         self._robot = bodies.add_robot(client, start_pose, visual, self.robot)
         x, y, yaw = start_pose
         self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
@@ -174,7 +175,7 @@ class Simulation:
         self._mover_bodies = list(
             zip(bodies.add_movers(client, movers.discs, visual), movers.radii.tolist(), strict=True)
         )
-        self._segments = np.ascontiguousarray(map.segments(), dtype=np.float64)
+        self._segments = NearSegments(map.segments(), self.robot.lidar.max_range_m)
         self._boxes, static = map.solids()
         # The last rows are the movers' own, so that they are sensed where they walk.
         self._circles = np.concatenate([static, movers.discs])
@@ -212,6 +213,7 @@ class Simulation:
         """
         client, body, movers, robot = self._client, self._robot, self._movers, self.robot
         x, y, yaw = self._pose
+        self._static.follow(x, y)
         v_c, omega_c = self._v_c, self._omega_c
         cos, sin = math.cos(yaw), math.sin(yaw)
         gap_m = movers.step(x, y)
@@ -302,8 +304,9 @@ class Simulation:
             :func:`rcdsac_trl.world.sim.lidar.sector_distances`.
         """
         distances = np.empty(NUM_BINS)
-        max_range_m = self.robot.lidar.max_range_m
-        self._clearance_m = scan(distances, *self._pose, self._segments, self._circles, max_range_m)
+        x, y, yaw = self._pose
+        segments, max_range_m = self._segments.near(x, y), self.robot.lidar.max_range_m
+        self._clearance_m = scan(distances, x, y, yaw, segments, self._circles, max_range_m)
         return distances
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.generator import SPLITS, MapSettings, Split
+from rcdsac_trl.world.maps.map_source import MapSource, with_digests
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.sim.simulation import Simulation
@@ -36,7 +37,7 @@ class AgentGroup(OfOneProcess):
     It can be neither copied nor pickled: its simulations live in PyBullet.
 
     Args:
-        map_settings: how maps are generated.
+        map_settings: what maps are made from, the generator's settings or those of files.
         task: rules of the task.
         sensor: one of :data:`rcdsac_trl.robot.range_sensor.SENSORS`.
         split: which of the disjoint map sets.
@@ -57,7 +58,7 @@ class AgentGroup(OfOneProcess):
 
     def __init__(
         self,
-        map_settings: MapSettings | None,
+        map_settings: MapSource | None,
         task: TaskSettings | None,
         *,
         sensor: str,
@@ -75,9 +76,11 @@ class AgentGroup(OfOneProcess):
             raise UserInputError(f"agent_ids={list(agent_ids)} must be one or more whole numbers of at least 0")
         self.task = task or TaskSettings()
         mask = robot.sensor_mask(sensor)
+        # As the files are now: what is read of them is kept, and another environment may find others.
+        maps = with_digests(map_settings or MapSettings())
         self._agents = [
             NavigationAgent(
-                map_settings or MapSettings(),
+                maps,
                 self.task,
                 mask,
                 split,

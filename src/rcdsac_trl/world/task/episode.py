@@ -19,7 +19,8 @@ from rcdsac_trl.robot.observation import Point, distance_and_bearing
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.seeding import stream
-from rcdsac_trl.world.maps.generator import MapSettings, Split, generate_map
+from rcdsac_trl.world.maps.generator import Split
+from rcdsac_trl.world.maps.map_source import MapSource, make_map
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.render import Scene
@@ -37,18 +38,18 @@ _TRAIL_STEPS = 1000
 
 @lru_cache(maxsize=_MAPS_KEPT)
 def load_map(
-    settings: MapSettings, split: Split, seed: int, index: int, robot_radius_m: float = PAPER.circumradius_m
+    source: MapSource, split: Split, seed: int, index: int, robot_radius_m: float = PAPER.circumradius_m
 ) -> tuple[Map, Planner]:
     """Return a map and its planner, shared by all agents of this process.
 
     Args:
-        settings: how maps are generated.
+        source: what maps are made from.
         split: which of the disjoint map sets.
         seed: root seed.
         index: which map; episode ``k`` of every agent takes place on map ``k``.
         robot_radius_m: circumradius of the robot that drives there.
     """
-    map_ = generate_map(settings, split, seed, index, robot_radius_m)
+    map_ = make_map(source, split, seed, index, robot_radius_m)
     return map_, Planner(map_, robot_radius_m)
 
 
@@ -64,7 +65,7 @@ class NavigationAgent:
     The simulation is made at the first reset, so that making an agent costs nothing.
 
     Args:
-        map_settings: how maps are generated.
+        map_settings: what maps are made from.
         task: rules of the task.
         mask: bins that the sensor has, bool [180].
         split: which of the disjoint map sets.
@@ -82,7 +83,7 @@ class NavigationAgent:
         reward_components: of the last step, see :func:`~rcdsac_trl.world.task.rules.reward_components`; zeros after
             a reset.
         distances_m: what the range sensor measures, float64 [180], m.
-        remembered: what it remembers, float32 [46], see
+        remembered: what it remembers, float32 [65], see
             :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`; None without a memory.
     """
 
@@ -96,7 +97,7 @@ class NavigationAgent:
 
     def __init__(
         self,
-        map_settings: MapSettings,
+        map_settings: MapSource,
         task: TaskSettings,
         mask: NDArray[np.bool_],
         split: Split,
@@ -114,7 +115,7 @@ class NavigationAgent:
         self._robot = robot
         self._memory = None
         if memory_s > 0.0:
-            self._memory = RememberedRanges(mask, memory_s, robot.lidar.max_range_m, robot.body_radius_m)
+            self._memory = RememberedRanges(mask, memory_s, robot)
         self._simulation: Simulation | None = None
         self._trail: deque[tuple[float, float]] = deque(maxlen=_TRAIL_STEPS)
 
@@ -122,9 +123,7 @@ class NavigationAgent:
         """Begin an episode, on the map of the same number."""
         self._seed, self._episode = seed, episode
         self._map, self._planner = load_map(self._map_settings, self._split, seed, episode, self._robot.circumradius_m)
-        rng = self._stream("start")
-        x, y = self._planner.sample_free(rng).tolist()
-        self.pose = (x, y, rng.uniform(-math.pi, math.pi))
+        self.pose = x, y, _ = self._map.start or self._drawn_start()
         self._motor_steps = draw_motor_steps(self._task, self._split, seed, episode, self._agent_id)
         if self._simulation is None:
             self._simulation = Simulation(gui=self._gui, robot=self._robot)
@@ -209,11 +208,21 @@ class NavigationAgent:
     def _stream(self, purpose: str, *index: int) -> np.random.Generator:
         return stream(self._seed, f"{purpose}/{self._split}", self._episode, self._agent_id, *index)
 
+    def _drawn_start(self) -> Pose:
+        rng = self._stream("start")
+        x, y = self._planner.sample_free(rng).tolist()
+        return x, y, rng.uniform(-math.pi, math.pi)
+
     def _draw_goal(self) -> None:
-        """Draw the next goal relative to the last one, and plan to it from where the robot is."""
-        rng = self._stream("goal", self._goals_drawn)
+        """Draw the next goal relative to the last one, and plan to it from where the robot is.
+
+        The first is the map's own, where it has one.
+        """
+        goal: Point | NDArray[np.float64] | None = self._map.goal if self._goals_drawn == 0 else None
+        if goal is None:
+            rng = self._stream("goal", self._goals_drawn)
+            goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
         self._goals_drawn += 1
-        goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
         # As plain floats: single numbers out of arrays are slow, and every step reads some.
         self._path = [(x, y) for x, y in self._planner.waypoints(self.pose[:2], goal).tolist()]
         self._goal = self._path[-1]

@@ -9,6 +9,7 @@ from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.checks import positive
 from rcdsac_trl.system.processes import resolve_num_workers
 from rcdsac_trl.world.maps.generator import MapSettings, check_robot_fits
+from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.task.rules import TaskSettings
 
 
@@ -17,7 +18,7 @@ class WorldSettings:
     """What an environment is made of.
 
     Attributes:
-        map_settings: how maps are generated.
+        map_settings: what maps are made from, the generator's settings or those of files.
         task: rules of the task.
         sensor: ``"narrow"``, ``"sparse"`` or ``"full"``.
         memory_s: for how long an agent is told of points that it saw and no longer sees, s; 0: not at all, as in the
@@ -39,7 +40,7 @@ class WorldSettings:
         10
     """
 
-    map_settings: MapSettings = field(default_factory=MapSettings)
+    map_settings: MapSource = field(default_factory=MapSettings)
     task: TaskSettings = field(default_factory=TaskSettings)
     sensor: str = "narrow"
     memory_s: float = 0.0
@@ -55,7 +56,8 @@ class WorldSettings:
             raise UserInputError(f"sensor.name={self.sensor} is unknown: choose one of {', '.join(sorted(SENSORS))}")
         check_memory(self.memory_s)
         self.robot.sensor_mask(self.sensor)
-        check_robot_fits(self.map_settings, self.robot.circumradius_m, self.robot.name)
+        if isinstance(self.map_settings, MapSettings):
+            check_robot_fits(self.map_settings, self.robot.circumradius_m, self.robot.name)
         if self.num_agents < 1:
             raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
         resolve_num_workers(self.num_workers, self.num_agents)
