@@ -15,6 +15,7 @@ import bench_world as bench
 def _make_naive() -> None:
     """Make every simulation of this process a naive one."""
     from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+    from rcdsac_trl.robot.robot_settings import PAPER
     from rcdsac_trl.world.sim import bodies, simulation
     from rcdsac_trl.world.sim.bullet import pybullet
 
@@ -26,7 +27,7 @@ def _make_naive() -> None:
         angles = yaw + (np.arange(NUM_BINS) + 0.5) * (2.0 * math.pi / NUM_BINS)
         directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(NUM_BINS)], axis=1)
         here = np.array([x, y, 0.0])
-        near, far = simulation.ROBOT_RADIUS_M + 1e-3, MAX_RANGE_M
+        near, far = PAPER.circumradius_m + 1e-3, MAX_RANGE_M
         hits = pybullet.rayTestBatch(
             (here + near * directions).tolist(), (here + far * directions).tolist(), physicsClientId=self._client
         )

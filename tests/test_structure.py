@@ -255,6 +255,7 @@ def test_every_key_of_the_configuration_is_explained() -> None:
         "map/mixed.yaml",
         "map/file.yaml",
         "map/barn.yaml",
+        "robot/paper.yaml",
         "experiment/grid.yaml",
     ):
         assert all(commented for name, _, commented in entries if name == root), root
@@ -262,7 +263,7 @@ def test_every_key_of_the_configuration_is_explained() -> None:
 
 def test_presets_change_only_what_the_root_explains() -> None:
     entries = list(keys_with_comments())
-    groups = {"map", "sensor", "task", "logger", "collector", "algo"}
+    groups = {"map", "robot", "sensor", "task", "logger", "collector", "algo"}
     known = {key for name, key, _ in entries if name == "train.yaml" or name.split("/")[0] in groups}
     for name, key, _ in entries:
         if name.startswith("preset/"):

@@ -147,7 +147,11 @@ def test_an_evaluation_changes_single_keys_of_what_was_trained() -> None:
     ("config_name", "overrides", "sentence"),
     [
         ("train", ["algo.beta=-1"], "algo.beta needs a choice of algo: add +algo=<name>, one of dsac_cvar, "),
-        ("train", [POW, "sensor.max_range_m=10"], "there is no key sensor.max_range_m: sensor has name"),
+        (
+            "train",
+            [POW, "sensor.max_range_m=10"],
+            "there is no key sensor.max_range_m: did you mean robot.lidar.max_range_m?",
+        ),
         ("train", [POW, "learner.num_agents=2"], "there is no key learner.num_agents: did you mean world.num_agents?"),
         (
             "train",

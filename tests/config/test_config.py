@@ -269,6 +269,8 @@ def test_read_refuses_in_one_sentence(changes: dict[str, Any], sentence: str) ->
 # Read by __post_init__ alone, because all it is for is to be refused; and decided upon before settings are made.
 ONLY_CHECKED = {("MapSettings", "version"), ("TaskSettings", "version"), ("TrainingSettings", "resume")}
 PLUMBING = {"__post_init__", "__eq__", "__hash__", "__repr__", "_asdict_inner"}
+# What checks work out first, and everybody else then takes as it was kept.
+KEPT = {"outline", "circumradius_m", "inradius_m", "mask"}
 
 
 @dataclass(frozen=True)
@@ -292,8 +294,8 @@ class Reads:
 def plumbing(frame: FrameType | None) -> bool:
     """Tell whether a read is a part of a dataclass's own doing, however deep below."""
     while frame is not None:
-        if frame.f_code.co_name in PLUMBING:
-            return True
+        if frame.f_code.co_name in PLUMBING | KEPT:
+            return frame.f_code.co_name in PLUMBING
         frame = frame.f_back
     return False
 
@@ -337,7 +339,7 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     turned = "beta_controller=[clearance,tail_variance]"
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")
     evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
-    evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5")
+    evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5", "robot=jackal")
     write_map_server(tmp_path / "a.yaml", room(80, 80))
     (tmp_path / "b.map").write_text("type octile\nheight 9\nwidth 9\nmap\n" + 9 * (9 * "." + "\n"))
     more = ["map.unmapped_clutter_per_m2=0.02", "map.num_movers=1", "task.episode_steps=5"]

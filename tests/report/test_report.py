@@ -162,6 +162,19 @@ def test_other_maps_starts_or_rules_are_refused(tmp_path: Path, changed: dict, s
         read_episodes([a, b])
 
 
+def test_results_of_two_robots_are_refused(tmp_path: Path) -> None:
+    paper, slow, burger = {"name": "paper", "speed": 0.6}, {"name": "paper", "speed": 0.4}, {"name": "burger"}
+    before = evaluate(tmp_path / "before", "sac", {NONE: 0})  # says nothing of a robot
+    own = evaluate(tmp_path / "own", "dsac_pow", {NONE: 0}, robot=paper)
+    assert len(read_episodes([before, own]).conditions) == 2
+    for name, robot, told in (("slow", slow, "paper and paper"), ("other", burger, "paper and burger")):
+        other = evaluate(tmp_path / name, "rcdsac_pow", {-1.0: 0}, robot=robot)
+        with pytest.raises(UserInputError, match=rf"are of two robots \({told}, or one with other numbers\)"):
+            read_episodes([own, other])
+    with pytest.raises(UserInputError, match=r"are of two robots \(paper and burger"):
+        read_episodes([before, other])
+
+
 def test_the_same_agent_twice_is_refused_but_another_training_seed_is_not(tmp_path: Path) -> None:
     a, b = evaluate(tmp_path / "a", "sac", {NONE: 0}), evaluate(tmp_path / "b", "sac", {NONE: 2})
     with pytest.raises(UserInputError, match="hold the same agent, training seed and beta"):

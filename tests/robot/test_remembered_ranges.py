@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.dead_reckoning import DeadReckoning
+from rcdsac_trl.robot.foreseen_clearance import ForeseenClearance
 from rcdsac_trl.robot.observation import NUM_REMEMBERED_SECTORS, REMEMBERED_SIZE
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
@@ -155,10 +156,34 @@ def test_what_walks_is_told_with_its_velocity_and_leaves_no_trail() -> None:
     assert told[36] == pytest.approx(near, abs=0.03)
     assert told[37:39] == pytest.approx([near * math.sqrt(0.5), -near * math.sqrt(0.5)], abs=0.05)
     assert told[39:41] == pytest.approx([0.0, -0.5], abs=0.08)
-    assert not told[41:].any()
+    assert not told[41:46].any()
     # It covers about 13 degrees around 315, and nothing is left of where it was seen before.
     assert set(sectors(told)) <= {30, 31, 32}
     assert sectors(told)[31] == pytest.approx(near, abs=0.03)
+
+
+def test_what_walked_out_of_view_may_have_stopped_there() -> None:
+    """It is expected where its velocity takes it, and where it was seen last, until its track ends."""
+    remembered = RememberedRanges(NARROW, memory_s=12.0)
+    walk_past(remembered, 30)  # it is 1.5 m ahead, and walks to the right at 0.5 m/s
+    blind = np.zeros(180, np.bool_)
+    for _ in range(8):  # a turn to the left by 94.5 degrees
+        told = remembered.observe(NOTHING, 0.0, math.pi / 2, PERIOD_S, blind)
+    # Seen last at -94 degrees; its track is at (1.5, -0.59) m where it began, at -115 degrees.
+    assert told[26] == pytest.approx(nearness(1.25), abs=0.05)
+    assert told[24] == pytest.approx(nearness(math.hypot(1.5, 0.59) - 0.25), abs=0.1)
+    for _ in range(7):  # 2.1 s after it was seen
+        told = remembered.observe(NOTHING, 0.0, 0.0, PERIOD_S, blind)
+    assert not sectors(told)
+
+
+def test_foreseen_clearances_are_told_of_what_is_remembered() -> None:
+    remembered = RememberedRanges(NARROW, memory_s=12.0)
+    told = remembered.observe(at_bin(0, 0.84 + 0.3), 0.6, 0.0, 0.0)
+    points, _ = remembered.places((0.0, 0.0, 0.0))
+    expected = ForeseenClearance().nearness(points, np.empty((0, 6)), np.zeros(3), 0.6, 0.0)
+    assert expected.any()
+    np.testing.assert_array_equal(told[46:], expected)
 
 
 def test_left_and_right_are_alike() -> None:

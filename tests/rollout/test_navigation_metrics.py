@@ -17,6 +17,7 @@ PERIOD_S = 0.5
 class Room:
     """Stands in for a planner: one pillar, and every way straight."""
 
+    robot_radius_m = 0.25
     map = SimpleNamespace(solids=lambda: (np.zeros((0, 6)), np.array([[0.0, 1.0, 0.25]])))
 
     def path_length(self, start: Any, goal: Any) -> float:

@@ -77,7 +77,7 @@ def scripted(monkeypatch: pytest.MonkeyPatch):
         planner, simulation = ScriptedPlanner(corners), ScriptedSimulation()
         simulation.script = script
         monkeypatch.setattr(core, "load_map", lambda *_: (EMPTY, planner))
-        monkeypatch.setattr(core, "Simulation", lambda gui: simulation)
+        monkeypatch.setattr(core, "Simulation", lambda gui, robot: simulation)
         group = AgentGroup(
             MapSettings(),
             task,

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
 from rcdsac_trl.config.typed import read, section_class
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
+from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.processes import resolve_processes
@@ -22,7 +22,7 @@ Name = Literal["best", "last"] | int
 """How users name a checkpoint; a number: by the iterations that were done."""
 
 
-Section = TypeVar("Section", SensorSettings, TaskSettings)
+Section = TypeVar("Section", SensorSettings, TaskSettings, RobotSettings)
 
 _MOST_FPS = 120
 
@@ -123,6 +123,7 @@ class EvaluationSettings:
     map: Mapping[str, Any] | None = None
     sensor: Mapping[str, Any] | None = None
     task: Mapping[str, Any] | None = None
+    robot: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what is below its limit, and neither or both of run and baseline."""
@@ -162,8 +163,22 @@ class EvaluationSettings:
         sensor, task = _changed(trained.sensor, self.sensor, "sensor"), _changed(trained.task, self.task, "task")
         if not isinstance(maps, BarnMapSettings):
             return ChosenWorld(maps, sensor, task)
-        steps = math.ceil(TIME_LIMIT_S / (min(task.motor_steps) * MOTOR_PERIOD_S))
+        steps = math.ceil(TIME_LIMIT_S / (min(task.motor_steps) * self.robot_of(trained).motor_period_s))
         return ChosenWorld(maps.files(), sensor, replace(task, goal_radius_m=GOAL_RADIUS_M, episode_steps=steps), maps)
+
+    def robot_of(self, trained: TrainingSettings) -> RobotSettings:
+        """Return the robot: that of a training, or for a baseline the one that was chosen.
+
+        Raises:
+            UserInputError: for a key or a value that it does not have, and another robot than an agent was trained for.
+        """
+        robot = _changed(trained.robot, self.robot, "robot")
+        if self.run is not None and robot != trained.robot:
+            raise UserInputError(
+                f"robot={robot.name} is not what {self.run} drives: it was trained for robot={trained.robot.name} as "
+                "it was then, leave robot out"
+            )
+        return robot
 
 
 def _changed_maps(trained: MapSource, values: Mapping[str, Any] | None) -> MapSource | BarnMapSettings:
@@ -180,7 +195,16 @@ def _changed_maps(trained: MapSource, values: Mapping[str, Any] | None) -> MapSo
 def _changed(section: Section, values: Mapping[str, Any] | None, name: str) -> Section:
     if not values:
         return section
-    return read(type(section), {**vars(section), **values}, name)
+    return read(type(section), _merged(asdict(section), values), name)
+
+
+def _merged(into: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a section with changed values, of the sections in it too."""
+    changed = {
+        key: _merged(into[key], value) if isinstance(value, Mapping) and isinstance(into.get(key), Mapping) else value
+        for key, value in values.items()
+    }
+    return {**into, **changed}
 
 
 @dataclass(frozen=True)

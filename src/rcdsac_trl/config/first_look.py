@@ -36,8 +36,9 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     if settings.run is not None:
         trained.algo.conditions(settings.beta, settings.collision_weight)
     chosen = settings.world_of(trained)
-    WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s)
-    check_maps(chosen.maps, chosen.task.min_path_m)
+    robot = settings.robot_of(trained)
+    WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=robot)
+    check_maps(chosen.maps, chosen.task.min_path_m, robot.circumradius_m)
     _look_at_out(settings.out)
 
 
@@ -50,7 +51,7 @@ def look_at_calibration(cfg: DictConfig) -> None:
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is not None:
         trained = find_agent(settings.run).settings()
-        check_maps(trained.map, trained.task.min_path_m)
+        check_maps(trained.map, trained.task.min_path_m, trained.robot.circumradius_m)
     _look_at_out(settings.out)
 
 

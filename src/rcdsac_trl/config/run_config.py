@@ -16,6 +16,7 @@ from rcdsac_trl.config.compose import choices
 from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.map_source import check_maps, with_digests
 from rcdsac_trl.world.task.rules import TaskSettings
@@ -57,7 +58,7 @@ def settings_of_new_run(cfg: DictConfig) -> TrainingSettings:
     settings = training_settings(cfg)
     settings.logger.check_backends()
     settings.collector.check_package()
-    check_maps(settings.map, settings.task.min_path_m)
+    check_maps(settings.map, settings.task.min_path_m, settings.robot.circumradius_m)
     return settings
 
 
@@ -94,6 +95,8 @@ class AgentOfRun:
     sensor: SensorSettings
     network: NetworkSettings
     task: TaskSettings
+    # Runs of earlier versions name none.
+    robot: RobotSettings = PAPER
 
 
 def agent_of_run(folder: Path) -> AgentOfRun:
@@ -102,7 +105,7 @@ def agent_of_run(folder: Path) -> AgentOfRun:
     Raises:
         UserInputError: as :func:`settings_of_run`.
     """
-    names = ("algo", "sensor", "network", "task")
+    names = ("algo", "sensor", "network", "task", "robot")
     return _of_run(folder, "run", lambda values: read(AgentOfRun, {n: values[n] for n in names if n in values}))
 
 

@@ -4,12 +4,16 @@ import importlib.util
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.world.maps.map_source import MapSource
@@ -128,6 +132,7 @@ class TrainingSettings:
     checkpoint: CheckpointSettings
     # Runs of earlier versions name none: this is what they had.
     collector: CollectorSettings = SINGLE
+    robot: RobotSettings = PAPER
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together, or not this machine."""
@@ -172,7 +177,13 @@ class TrainingSettings:
             num_agents=self.world.num_agents,
             num_workers=self.world.num_workers,
             worker_timeout_s=self.world.worker_timeout_s,
+            robot=self.robot,
         )
+
+    @property
+    def sensor_mask(self) -> NDArray[np.bool_]:
+        """Which of the 180 range bins the agent is told, bool [180]."""
+        return self.robot.sensor_mask(self.sensor.name)
 
     @property
     def replay_steps(self) -> int:

@@ -127,11 +127,16 @@ def _fit(value: Any, hint: Any, path: str) -> Any:
                 each = get_args(option)[1]
                 return {str(key): _fit(below, each, _join(path, str(key))) for key, below in value.items()}
         elif _is_a(value, option):
-            return tuple(value) if isinstance(value, list) else value
+            return _with_tuples(value)
     wanted = " or ".join(_describe(option) for option in options)
     shown = "null" if value is None else value
     as_text = f"; as a text: {quoted(path, str(shown))}" if str in options and isinstance(value, int | float) else ""
     raise UserInputError(f"{path}={shown} must be {wanted}{as_text}")
+
+
+def _with_tuples(value: Any) -> Any:
+    """Return lists, of lists too, as tuples, and anything else as it is."""
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
 def _is_a(value: Any, hint: Any) -> bool:
@@ -161,6 +166,8 @@ def _describe(hint: Any) -> str:
     if origin is tuple:
         if get_origin(args[0]) is Literal:
             return f"a list of some of {', '.join(map(str, get_args(args[0])))} in brackets"
+        if get_origin(args[0]) is tuple:
+            return f"a list of lists in brackets, each {_describe(args[0]).removesuffix(' in brackets')}"
         number = "" if args[-1] is Ellipsis else f"{len(args)} "
         return f"a list of {number}{_PLURALS[args[0]]} in brackets"
     return _NAMES.get(hint, "a section with keys of its own")

@@ -152,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
         type=float,
         nargs=3,
         metavar=("X_M", "Y_M", "YAW_RAD"),
-        help="where the scanner sits, from the robot's centre; else as /tf says, at the centre where nobody does",
+        help="where the scanner sits, from the robot's centre; else as /tf says, or where the agent's robot has it",
     )
     parser.add_argument("--laser-upside-down", action="store_true", help="the scanner hangs")
     for reading in ("0", "NaN"):

@@ -106,6 +106,7 @@ def _described(settings: CalibrationSettings, named: NamedAgent, conditions: Seq
         "measure": trained.algo.distortion.name,
         "sensor": trained.sensor.name,
         "memory_s": trained.sensor.memory_s,
+        "robot": trained.robot.plain(),
         "train_seed": trained.seed,
         **named.described,
         "split": settings.split,
@@ -137,6 +138,7 @@ def _driver(
         task=trained.task,
         sensor=trained.sensor.name,
         memory_s=trained.sensor.memory_s,
+        robot=trained.robot,
         num_agents=group * len(conditions),
         num_workers=0,  # a process drives whole maps
     )

@@ -19,6 +19,7 @@ from rcdsac_trl.evaluation.film.filming import write_film
 from rcdsac_trl.evaluation.film.video import check_extra
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.release.named_agent import NamedAgent, named_agent
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.rollout.collisions import COLLISIONS, collision_table
 from rcdsac_trl.rollout.evaluation_pool import Rows, evaluate_maps
 from rcdsac_trl.rollout.make_agent import packed, packed_loss
@@ -54,12 +55,12 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     named = None if settings.run is None else named_agent(settings.run, settings.checkpoint)
     trained = default_training() if named is None else named.settings
     chosen = settings.world_of(trained)
-    check_maps(chosen.maps, chosen.task.min_path_m)
+    check_maps(chosen.maps, chosen.task.min_path_m, settings.robot_of(trained).circumradius_m)
     worlds = [] if chosen.barn is None else timed(chosen.barn.worlds()[: settings.num_maps])
     num_maps = len(worlds) or settings.num_maps
     spec = _spec(settings, trained, chosen)
     if settings.baseline is not None:
-        check_baseline(settings.baseline, spec.world.sensor)
+        check_baseline(settings.baseline, spec.world.sensor, spec.world.robot)
     processes = 0 if settings.gui else resolve_processes(settings.num_workers, num_maps)
     simulations = max(1, processes) * spec.world.num_agents
     remedy = "lower num_episodes or num_workers, or end other programs"
@@ -128,6 +129,8 @@ def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: Name
     maps = "barn" if spec.one_trip else settings.split
     name = f"{maps}-seed{settings.seed}-{num_maps}x{settings.num_episodes}"
     if named is None:
+        if spec.world.robot != PAPER:
+            name = f"{spec.world.robot.name}-{name}"
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
     return named.folder_of("evaluation", f"{name}{contexts}")
@@ -143,6 +146,7 @@ def _described(
         "measure": None if named is None else trained.algo.distortion.name,
         "sensor": spec.world.sensor,
         "memory_s": spec.world.memory_s,
+        "robot": spec.world.robot.plain(),
         "train_seed": None if named is None else trained.seed,
         **({"checkpoint": None} if named is None else named.described),
         "split": settings.split,
@@ -197,4 +201,5 @@ def _evaluation_world(
         num_agents=settings.num_episodes * num_conditions,
         num_workers=0,  # a process drives whole maps
         gui=settings.gui,
+        robot=settings.robot_of(trained),
     )

@@ -15,6 +15,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import RunAgent, named_agent
 from rcdsac_trl.release.run_weights import weights_of_run
 from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.resources import check_writable
@@ -103,7 +104,8 @@ def make_publication(cfg: DictConfig) -> Publication:
                 "run folder"
             )
         weights = weights_of_run(run, settings.checkpoint)
-        name = f"{weights.config.name}-{weights.config.sensor}"
+        config = weights.config
+        name = f"{config.name}-{config.sensor}" + ("" if config.robot == PAPER else f"-{config.robot.name}")
         if name in agents:
             raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
         agents[name] = Published(run, weights, agent.training, _evaluation_of(run, settings.checkpoint))

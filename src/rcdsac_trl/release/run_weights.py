@@ -16,7 +16,6 @@ from rcdsac_trl.config.run_config import CHECKPOINTS, AgentOfRun, agent_of_run
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Context, Weights
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.storage.checkpoint import load_states
 from rcdsac_trl.storage.checkpoint_record import Progress
 
@@ -99,7 +98,7 @@ def agent_config(
         num_critics: number of critics.
         provenance: where it comes from.
     """
-    algo, task = agent.algo, agent.task
+    algo, task, motor_period_s = agent.algo, agent.task, agent.robot.motor_period_s
     context: Context | None = None
     context_range = None
     if (measure := algo.network_measure) is not None:
@@ -117,7 +116,7 @@ def agent_config(
         embedding=None if measure is None else _embedding(measure),
         fixed_beta=algo.beta,
         network=agent.network.widths,
-        period_s=(min(task.motor_steps) * MOTOR_PERIOD_S, max(task.motor_steps) * MOTOR_PERIOD_S),
+        period_s=(min(task.motor_steps) * motor_period_s, max(task.motor_steps) * motor_period_s),
         waypoint_radius_m=task.waypoint_radius_m,
         goal_radius_m=task.goal_radius_m,
         provenance=provenance,
@@ -125,6 +124,7 @@ def agent_config(
         memory_s=agent.sensor.memory_s,
         range_code=agent.network.range_code,
         restart_steps=agent.network.restart_steps,
+        robot=agent.robot,
     )
 
 

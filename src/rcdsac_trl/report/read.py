@@ -231,6 +231,23 @@ def _check_same_maps(evaluations: Sequence[Evaluation]) -> None:
                     f"{first.folder} and {other.folder} did not meet the same maps, starts and goals ({what} is {here} "
                     f"and {there}): evaluate them alike, or report on them apart"
                 )
+        if not _same_robot(here := first.described.get("robot"), there := other.described.get("robot")):
+            names = " and ".join(_robot_name(robot) for robot in (here, there))
+            raise UserInputError(
+                f"{first.folder} and {other.folder} are of two robots ({names}, or one with other numbers), whose "
+                "results do not compare: report on them apart"
+            )
+
+
+def _same_robot(one: dict[str, Any] | None, other: dict[str, Any] | None) -> bool:
+    """Compare two robots; evaluations of earlier versions say nothing of theirs, the paper's."""
+    if one is None or other is None:
+        return _robot_name(one) == _robot_name(other)
+    return one == other
+
+
+def _robot_name(robot: dict[str, Any] | None) -> str:
+    return "paper" if robot is None else str(robot["name"])
 
 
 def _check_complete(table: pd.DataFrame, protocol: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The robot's limits and its motor period (paper, section "Actions")."""
+"""Limits and motor period of the paper's robot (section "Actions"); see :class:`.robot_settings.RobotSettings`."""
 
 import math
 
@@ -11,11 +11,13 @@ MAX_LINEAR_VELOCITY = 0.6
 """w_maxv, m/s."""
 
 
-MAX_ANGULAR_VELOCITY = math.radians(90.0)
+MAX_TURN_DEG_PER_S = 90.0
+MAX_ANGULAR_VELOCITY = math.radians(MAX_TURN_DEG_PER_S)
 """w_maxomega, rad/s."""
 
 
-DEAD_BAND = math.radians(15.0)
+DEAD_BAND_DEG_PER_S = 15.0
+DEAD_BAND = math.radians(DEAD_BAND_DEG_PER_S)
 """Desired angular velocities below this are taken as 0, rad/s."""
 
 
@@ -23,7 +25,8 @@ MAX_LINEAR_ACCELERATION = 1.5
 """w_accv, m/s^2."""
 
 
-MAX_ANGULAR_ACCELERATION = math.radians(120.0)
+MAX_TURN_ACCELERATION_DEG_PER_S2 = 120.0
+MAX_ANGULAR_ACCELERATION = math.radians(MAX_TURN_ACCELERATION_DEG_PER_S2)
 """w_accomega, rad/s^2."""
 
 

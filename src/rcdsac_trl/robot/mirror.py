@@ -6,7 +6,14 @@ Whatever a robot meets could as well be on its other side, so every experience i
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.robot.observation import NUM_REMEMBERED_MOVERS, NUM_REMEMBERED_SECTORS, REMEMBERED_MOVER_SIZE
+from rcdsac_trl.robot.foreseen_clearance import MIRRORED_COMMANDS
+from rcdsac_trl.robot.observation import (
+    NUM_FORESEEN_COMMANDS,
+    NUM_REMEMBERED_MOVERS,
+    NUM_REMEMBERED_SECTORS,
+    REMEMBERED_MOVER_SIZE,
+    REMEMBERED_SIZE,
+)
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 
 _SECTORS = np.arange(NUM_REMEMBERED_SECTORS)
@@ -17,8 +24,11 @@ MIRRORED: dict[str, tuple[NDArray[np.intp], NDArray[np.float32]]] = {
     "waypoint": (np.arange(6), np.array([1, 1, -1] * 2, np.float32)),
     "velocity": (np.arange(4), np.array([1, -1] * 2, np.float32)),
     "remembered": (
-        np.concatenate([_SECTORS[::-1], _MOVERS]),
-        np.array([1] * NUM_REMEMBERED_SECTORS + [1, 1, -1, 1, -1] * NUM_REMEMBERED_MOVERS, np.float32),
+        np.concatenate([_SECTORS[::-1], _MOVERS, REMEMBERED_SIZE - NUM_FORESEEN_COMMANDS + MIRRORED_COMMANDS]),
+        np.array(
+            [1] * NUM_REMEMBERED_SECTORS + [1, 1, -1, 1, -1] * NUM_REMEMBERED_MOVERS + [1] * NUM_FORESEEN_COMMANDS,
+            np.float32,
+        ),
     ),
     "action": (np.arange(2), np.array([1, -1], np.float32)),
 }

@@ -66,10 +66,12 @@ class MoverTracks:
         settings: what counts as moving.
         sensed: which of the 180 sectors the sensor has, bool [180]. Sectors without neighbours see no width, so
             nothing is tracked by a sparse sensor.
+        max_range_m: reach of the sensor.
     """
 
-    def __init__(self, settings: TrackSettings, sensed: NDArray[np.bool_]) -> None:
+    def __init__(self, settings: TrackSettings, sensed: NDArray[np.bool_], max_range_m: float = MAX_RANGE_M) -> None:
         self.settings = settings
+        self._max_range_m = max_range_m
         self.sensed = np.asarray(sensed, np.bool_)
         self._tracks = np.zeros((_MOST_TRACKS, 7))
 
@@ -83,7 +85,7 @@ class MoverTracks:
         """Move the tracks on, and correct those that are seen.
 
         Args:
-            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m.
+            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is in reach.
             pose: the robot's x and y in m and yaw in rad, odometry frame.
             elapsed_s: since the last observation, s.
             sensed: those of the sensor's sectors that say something now, bool [180]; None: all of them.
@@ -92,7 +94,8 @@ class MoverTracks:
         settings, tracks = self.settings, self._tracks
         _move_on(tracks, elapsed_s, settings.coast_s)
         things = np.empty((NUM_BINS, 2))
-        number = _find(things, ranges_m, pose, sensed, settings.step_m, settings.widest_m, settings.radius_m)
+        sizes_m = settings.step_m, settings.widest_m, settings.radius_m
+        number = _find(things, ranges_m, pose, sensed, *sizes_m, self._max_range_m)
         _correct(tracks, things[:number], settings.gate_m, settings.position_gain, settings.velocity_gain)
 
     @property
@@ -129,6 +132,7 @@ def _find(
     step_m: float,
     widest_m: float,
     radius_m: float,
+    max_range_m: float,
 ) -> int:
     """Write the middles of small things that are seen whole, and return how many there are.
 
@@ -143,7 +147,7 @@ def _find(
     while done < NUM_BINS:
         first = (start + done) % NUM_BINS
         done += 1
-        if not sensed[first] or ranges_m[first] >= MAX_RANGE_M:
+        if not sensed[first] or ranges_m[first] >= max_range_m:
             continue
         last, near_m, count = first, ranges_m[first], 1
         while done < NUM_BINS:

@@ -14,7 +14,10 @@ from rcdsac_trl.robot.range_sensor import MAX_RANGE_M
 
 # Observations (paper, section "States and Observations").
 MIN_RANGE_M = 0.01
-"""Ranges are seen strictly between this and :data:`MAX_RANGE_M`."""
+"""Ranges are seen strictly between this and :data:`MAX_RANGE_M`, on the paper's robot.
+
+The observation of a sensor that reaches farther, or less far, holds the same numbers for the same shares of its reach.
+"""
 
 
 RANGE_OFFSET = 2.5
@@ -49,7 +52,11 @@ REMEMBERED_MOVER_SIZE = 5
 """Numbers for each of them."""
 
 
-REMEMBERED_SIZE = NUM_REMEMBERED_SECTORS + NUM_REMEMBERED_MOVERS * REMEMBERED_MOVER_SIZE
+NUM_FORESEEN_COMMANDS = 19
+"""Commands whose clearance is foreseen; see :mod:`rcdsac_trl.robot.foreseen_clearance`."""
+
+
+REMEMBERED_SIZE = NUM_REMEMBERED_SECTORS + NUM_REMEMBERED_MOVERS * REMEMBERED_MOVER_SIZE + NUM_FORESEEN_COMMANDS
 """Numbers that tell what is remembered; see :class:`rcdsac_trl.robot.remembered_ranges.RememberedRanges`."""
 
 Point = tuple[float, float]
@@ -64,17 +71,21 @@ def vector_observations(memory_s: float) -> dict[str, int]:
 
     Example:
         >>> vector_observations(0.0), vector_observations(12.0)["remembered"]
-        ({'waypoint': 6, 'velocity': 4}, 46)
+        ({'waypoint': 6, 'velocity': 4}, 65)
     """
     return VECTOR_OBSERVATIONS | ({"remembered": REMEMBERED_SIZE} if memory_s > 0.0 else {})
 
 
-def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float32]:
+def range_observation(distances: ArrayLike, mask: ArrayLike, max_range_m: float = MAX_RANGE_M) -> NDArray[np.float32]:
     """Return o_rng: 2.5 + log10 of the distance, 0 where nothing is within (0.01, 3) m or the mask is false.
+
+    Distances of a sensor with another reach are scaled to 3 m, so that it tells what is near in the same numbers: a
+    network, and whatever else reads an observation, is the same for all of them.
 
     Args:
         distances: [..., 180], m; ``inf`` where nothing is.
         mask: bool [180], the bins the sensor has; see :func:`sensor_mask`.
+        max_range_m: reach of the sensor.
 
     Returns:
         float32 [..., 180].
@@ -84,6 +95,8 @@ def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float
         [2.5, 1.5, 0.0]
     """
     d = np.asarray(distances, dtype=np.float64)
+    if max_range_m != MAX_RANGE_M:
+        d = d * (MAX_RANGE_M / max_range_m)
     observed = np.zeros(d.shape, dtype=np.float32)
     seen = (d > MIN_RANGE_M) & (d < MAX_RANGE_M) & np.asarray(mask, dtype=np.bool_)
     # Of the logarithms, the expensive part, only those that are seen.
@@ -91,18 +104,20 @@ def range_observation(distances: ArrayLike, mask: ArrayLike) -> NDArray[np.float
     return observed
 
 
-def range_distances(observed: ArrayLike) -> NDArray[np.float64]:
+def range_distances(observed: ArrayLike, max_range_m: float = MAX_RANGE_M) -> NDArray[np.float64]:
     """Return the distances of range observations, m; ``inf`` where nothing was seen. Undoes :func:`range_observation`.
 
     Args:
         observed: o_rng, [..., 180].
+        max_range_m: reach of the sensor.
 
     Example:
         >>> range_distances([2.5, 1.5, 0.0]).tolist()
         [1.0, 0.1, inf]
     """
     o = np.asarray(observed, dtype=np.float64)
-    return np.where(o > 0.0, 10.0 ** (o - RANGE_OFFSET), np.inf)
+    distances: NDArray[np.float64] = np.where(o > 0.0, 10.0 ** (o - RANGE_OFFSET), np.inf)
+    return distances if max_range_m == MAX_RANGE_M else distances * (max_range_m / MAX_RANGE_M)
 
 
 def waypoint_observation(pose: tuple[float, float, float], waypoint_1: Point, waypoint_2: Point) -> tuple[float, ...]:

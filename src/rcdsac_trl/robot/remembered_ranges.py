@@ -11,29 +11,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.dead_reckoning import DeadReckoning
+from rcdsac_trl.robot.foreseen_clearance import ForeseenClearance
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.observation import (
+    NUM_FORESEEN_COMMANDS,
     NUM_REMEMBERED_MOVERS,
     NUM_REMEMBERED_SECTORS,
     REMEMBERED_MOVER_SIZE,
     REMEMBERED_SIZE,
 )
-from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
 
 _SECTOR_RAD = 2.0 * math.pi / NUM_REMEMBERED_SECTORS
-# A cell holds the last point seen in it; the ring of cells is wider than what is remembered, 3 m around the robot.
+# A cell holds the last point seen in it; the ring of cells is wider than what is remembered, 3 m around the robot, by
+# so many cells.
 _CELL_M = 0.1
+_SPARE_CELLS = 4
 # A point stands for what is around it, up to the points of the next cells.
 _POINT_RADIUS_M = 0.07
-_NUM_CELLS = 64
 # A remembered point goes when its sector sees this much farther: about what cell, sector and odometry have moved it by.
 _CLEARING_MARGIN_M = 0.1
 # Points this near to a thing that moves are its own: about what its place is uncertain by.
 _MOVER_MARGIN_M = 0.2
-# Nearness counts from a circle inside the robot, whose sides are 0.23 m from its middle, so that it changes fast where
-# the robot nearly touches; what is nearer to that circle than the second distance is alike.
-_INNER_RADIUS_M = 0.2
+# What is nearer than this to the circle inside the robot, from which nearness counts, is alike.
 _LEAST_GAP_M = 0.02
 
 
@@ -43,6 +45,9 @@ class RememberedRanges:
     Args:
         sensed: which of the 180 sectors the sensor has, bool [180].
         memory_s: age at which a point is forgotten, above 0, s.
+        max_range_m: reach of the sensor.
+        inner_radius_m: of a circle inside the robot, whose sides are 0.23 m from its middle: nearness counts from
+            there, so that it changes fast where the robot nearly touches.
 
     Example:
         >>> from rcdsac_trl.robot.range_sensor import sensor_mask
@@ -51,16 +56,21 @@ class RememberedRanges:
         >>> ranges_m[0] = 0.48
         >>> told = remembered.observe(ranges_m, v=0.0, omega=0.0, elapsed_s=0.0)
         >>> told.shape, round(float(told[0]), 6)
-        ((46,), 1.0)
+        ((65,), 1.0)
     """
 
-    def __init__(self, sensed: NDArray[np.bool_], memory_s: float) -> None:
+    def __init__(self, sensed: NDArray[np.bool_], memory_s: float, robot: RobotSettings = PAPER) -> None:
+        max_range_m = robot.lidar.max_range_m
         self._sensed = np.ascontiguousarray(sensed, np.bool_)
         self._memory_s = memory_s
+        self._max_range_m = max_range_m
+        self._reach_m = max_range_m, robot.body_radius_m
+        self._foreseen = ForeseenClearance(robot)
+        num_cells = math.ceil(round(2.0 * max_range_m / _CELL_M, 6)) + _SPARE_CELLS
         # Rows of x and y in m, frame of the dead reckoning, and when it was seen, s; a row for every cell at most.
-        self._points = np.empty((_NUM_CELLS**2, 3))
-        self._cells = np.empty((_NUM_CELLS**2, 2), np.int32)  # of each point
-        self._rows = np.full((_NUM_CELLS, _NUM_CELLS), -1, np.int32)  # of each cell's point, -1 without one
+        self._points = np.empty((num_cells**2, 3))
+        self._cells = np.empty((num_cells**2, 2), np.int32)  # of each point
+        self._rows = np.full((num_cells, num_cells), -1, np.int32)  # of each cell's point, -1 without one
         self.reset()
 
     def reset(self) -> None:
@@ -68,7 +78,7 @@ class RememberedRanges:
         self._rows.fill(-1)
         self._number = 0
         self._reckoning = DeadReckoning()
-        self._tracks = MoverTracks(TrackSettings(), self._sensed)
+        self._tracks = MoverTracks(TrackSettings(), self._sensed, self._max_range_m)
         self._moving = np.empty((0, 6))
 
     def places(self, pose: tuple[float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -102,7 +112,7 @@ class RememberedRanges:
         """Move on, take in what is seen now, and return what is remembered.
 
         Args:
-            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m. Those
+            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is in reach. Those
                 that the sensor lacks are not read.
             v: linear velocity measured now, m/s.
             omega: angular velocity measured now, rad/s.
@@ -111,11 +121,13 @@ class RememberedRanges:
                 read either, so what is remembered there stays.
 
         Returns:
-            float32 [46]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
-            degrees, counter-clockwise from straight ahead: log10(2.8 m / (distance - 0.2 m)), 0 where nothing is known
-            within 3 m.
+            float32 [65]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
+            degrees, counter-clockwise from straight ahead: log10((R - r) / (distance - r)) with the sensor's reach R,
+            3 m, and the inner radius r, 0.2 m; 0 where nothing is known within R.
             Then, for each of the two nearest things that move: its nearness, that times the cosine and the sine of its
             bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
+            Last, for each of 19 commands, how near it would lead to all that; see
+            :class:`~rcdsac_trl.robot.foreseen_clearance.ForeseenClearance`.
         """
         self._reckoning.move(v, omega, elapsed_s)
         sensed = self._sensed if measured is None else self._sensed & measured
@@ -125,11 +137,15 @@ class RememberedRanges:
         moving = self._tracks.moving
         told = np.zeros(REMEMBERED_SIZE, np.float32)
         points, cells, rows = self._points, self._cells, self._rows
-        number = _forget(points, cells, rows, self._number, pose, time_s - self._memory_s, seen_m, sensed, moving)
-        self._number = _add(points, cells, rows, number, pose, time_s, seen_m, sensed, moving)
+        far_m, oldest_s = self._max_range_m, time_s - self._memory_s
+        number = _forget(points, cells, rows, self._number, pose, oldest_s, seen_m, sensed, moving, far_m)
+        # As old as what is forgotten when the mover's track ends.
+        of_mover_s = oldest_s + min(self._tracks.settings.coast_s, self._memory_s)
+        self._number = _add(points, cells, rows, number, pose, time_s, of_mover_s, seen_m, sensed, moving, far_m)
         self._moving = moving
-        _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose)
-        _tell_movers(told, moving, pose)
+        _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose, self._reach_m)
+        _tell_movers(told, moving, pose, self._reach_m)
+        told[-NUM_FORESEEN_COMMANDS:] = self._foreseen.nearness(points[: self._number], moving, pose, v, omega)
         return told
 
 
@@ -146,16 +162,17 @@ def _forget(
     seen_m: np.ndarray,
     sensed: np.ndarray,
     moving: np.ndarray,
+    far_m: float,
 ) -> int:
     """Drop what is old, far, seen through, or a mover's; return how many points are left, in the first rows."""
     for row in range(number - 1, -1, -1):
         x, y, time_s = points[row]
         distance_m = math.hypot(x - pose[0], y - pose[1])
-        gone = time_s < before_s or distance_m >= MAX_RANGE_M
+        gone = time_s < before_s or distance_m >= far_m
         if not gone:
             bin_ = math.floor((math.atan2(y - pose[1], x - pose[0]) - pose[2]) / BIN_RAD) % NUM_BINS
-            seen_through = distance_m < min(seen_m[bin_], MAX_RANGE_M) - _CLEARING_MARGIN_M
-            gone = (sensed[bin_] and seen_through) or _is_of_a_mover(x, y, moving, False)
+            seen_through = distance_m < min(seen_m[bin_], far_m) - _CLEARING_MARGIN_M
+            gone = (sensed[bin_] and seen_through) or _is_of_a_seen_mover(x, y, moving)
         if gone:
             rows[cells[row, 0], cells[row, 1]] = -1
             number -= 1
@@ -173,44 +190,48 @@ def _add(
     number: int,
     pose: np.ndarray,
     time_s: float,
+    of_mover_s: float,
     seen_m: np.ndarray,
     sensed: np.ndarray,
     moving: np.ndarray,
+    far_m: float,
 ) -> int:
-    """Put a point into the middle of each sector that sees one, but for movers that are seen; return how many are."""
+    """Put a point into the middle of each sector that sees one, those of movers with a time of their own."""
     for bin_ in range(NUM_BINS):
-        if not sensed[bin_] or seen_m[bin_] >= MAX_RANGE_M:
+        if not sensed[bin_] or seen_m[bin_] >= far_m:
             continue
         bearing = pose[2] + (bin_ + 0.5) * BIN_RAD
         x, y = pose[0] + seen_m[bin_] * math.cos(bearing), pose[1] + seen_m[bin_] * math.sin(bearing)
-        if _is_of_a_mover(x, y, moving, True):
-            continue
-        i, j = math.floor(y / _CELL_M) % _NUM_CELLS, math.floor(x / _CELL_M) % _NUM_CELLS
+        i, j = math.floor(y / _CELL_M) % rows.shape[0], math.floor(x / _CELL_M) % rows.shape[1]
         row = rows[i, j]
         if row < 0:
             row = rows[i, j] = number
             cells[row, 0], cells[row, 1] = i, j
             number += 1
-        points[row, 0], points[row, 1], points[row, 2] = x, y, time_s
+        points[row, 0], points[row, 1] = x, y
+        points[row, 2] = of_mover_s if _is_of_a_seen_mover(x, y, moving) else time_s
     return number
 
 
 @njit
-def _is_of_a_mover(x: float, y: float, moving: np.ndarray, seen_now: bool) -> bool:
-    """Say whether a point belongs to what moves; where that is itself not seen its place is a guess."""
+def _is_of_a_seen_mover(x: float, y: float, moving: np.ndarray) -> bool:
+    """Say whether a point belongs to what is seen moving."""
     for mover_x, mover_y, _, _, radius, unseen_s in moving:
-        near = math.hypot(x - mover_x, y - mover_y) < radius + _MOVER_MARGIN_M
-        if near and (unseen_s == 0.0 or not seen_now):
+        if unseen_s == 0.0 and math.hypot(x - mover_x, y - mover_y) < radius + _MOVER_MARGIN_M:
             return True
     return False
 
 
 @njit
-def _nearness(distance_m: float) -> float:
-    """Return 0 at 3 m, 1 at 0.48 m, 2 at 0.23 m, from the robot's middle."""
-    return math.log10(
-        (MAX_RANGE_M - _INNER_RADIUS_M) / (max(distance_m, _INNER_RADIUS_M + _LEAST_GAP_M) - _INNER_RADIUS_M)
-    )
+def _nearness(distance_m: float, reach_m: tuple[float, float]) -> float:
+    """Return, of the paper's robot, 0 at 3 m, 1 at 0.48 m, 2 at 0.23 m, from its middle.
+
+    Args:
+        distance_m: from the robot's middle.
+        reach_m: of the sensor, and radius of the circle from which nearness counts.
+    """
+    far_m, inner_m = reach_m
+    return math.log10((far_m - inner_m) / (max(distance_m, inner_m + _LEAST_GAP_M) - inner_m))
 
 
 @njit
@@ -223,15 +244,15 @@ def _cover(told: np.ndarray, bearing: float, radius_m: float, centre_m: float, n
 
 
 @njit
-def _tell_points(told: np.ndarray, points: np.ndarray, pose: np.ndarray) -> None:
+def _tell_points(told: np.ndarray, points: np.ndarray, pose: np.ndarray, reach_m: tuple[float, float]) -> None:
     """Write the nearness of the nearest point of each sector."""
     for x, y, _ in points:
         distance_m, bearing = math.hypot(x - pose[0], y - pose[1]), math.atan2(y - pose[1], x - pose[0]) - pose[2]
-        _cover(told, bearing, _POINT_RADIUS_M, distance_m, _nearness(distance_m))
+        _cover(told, bearing, _POINT_RADIUS_M, distance_m, _nearness(distance_m, reach_m))
 
 
 @njit
-def _tell_movers(told: np.ndarray, moving: np.ndarray, pose: np.ndarray) -> None:
+def _tell_movers(told: np.ndarray, moving: np.ndarray, pose: np.ndarray, reach_m: tuple[float, float]) -> None:
     """Write what moves into the sectors that it covers, and the nearest ones behind them."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     centres_m = np.hypot(moving[:, 0] - pose[0], moving[:, 1] - pose[1])
@@ -239,7 +260,7 @@ def _tell_movers(told: np.ndarray, moving: np.ndarray, pose: np.ndarray) -> None
     for place in range(len(order)):
         x, y, vx, vy, radius, _ = moving[order[place]]
         dx, dy, centre_m = x - pose[0], y - pose[1], centres_m[order[place]]
-        nearness = _nearness(centre_m - radius)
+        nearness = _nearness(centre_m - radius, reach_m)
         if nearness <= 0.0:
             break  # those behind it are farther away, movers are alike
         bearing = math.atan2(dy, dx) - pose[2]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController
 from rcdsac_trl.robot.observation import range_distances
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
 
 
@@ -21,6 +22,7 @@ class AdaptivePolicy(TensorDictModuleBase):
         policy: acts on `risk`.
         controllers: one an agent.
         predictor: of the returns of the agents whose controllers read them; None: no controller does.
+        max_range_m: reach of the range sensor.
 
     Attributes:
         told: the betas of each step since the last reset, ``[N]`` each.
@@ -31,12 +33,14 @@ class AdaptivePolicy(TensorDictModuleBase):
         policy: TensorDictModuleBase,
         controllers: Sequence[BetaController],
         predictor: QuantilePredictor | None = None,
+        max_range_m: float = MAX_RANGE_M,
     ) -> None:
         super().__init__()
         self.in_keys, self.out_keys = policy.in_keys, [*policy.out_keys, "risk"]
         self.policy = policy
         self.controllers = controllers
         self.predictor = predictor
+        self._max_range_m = max_range_m
         self.told: list[Tensor] = []
         self._quantiles: dict[int, NDArray[np.float32]] = {}
 
@@ -47,7 +51,7 @@ class AdaptivePolicy(TensorDictModuleBase):
             self.told, self._quantiles = [], {}
             for controller in self.controllers:
                 controller.reset()
-        distances = range_distances(tensordict["range"].numpy())
+        distances = range_distances(tensordict["range"].numpy(), self._max_range_m)
         betas = [
             controller(distances[row], self._quantiles.get(row)) for row, controller in enumerate(self.controllers)
         ]

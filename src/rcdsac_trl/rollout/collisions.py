@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.evaluation_pool import Rows
 from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS
 from rcdsac_trl.world.maps.geometry import segment_clearance
@@ -77,19 +77,23 @@ class CollisionRecorder:
         self._poses.append(buffers.pose.copy())
         self._movers.append(np.stack([self._agents.simulation(row).mover_positions for row in rows]))
 
-    def collisions(self, map_: Map, mask: NDArray[np.bool_], periods_s: Sequence[float]) -> list[Rows]:
+    def collisions(
+        self, map_: Map, mask: NDArray[np.bool_], periods_s: Sequence[float], robot: RobotSettings = PAPER
+    ) -> list[Rows]:
         """Return what is said of each agent's collisions, in their order; see :func:`diagnose`.
 
         Args:
             map_: that they drove on.
             mask: bins that the sensor has, bool [180].
             periods_s: length of each agent's steps, s.
+            robot: which one they are.
         """
         poses, movers = np.stack(self._poses, 1), np.stack(self._movers, 1)
         found: list[Rows] = [[] for _ in periods_s]
         for row, step, touch in self._began:
             until = slice(step + 1)
-            found[row].append(diagnose(touch, map_, mask, poses[row, until], movers[row, until], periods_s[row]))
+            moments = poses[row, until], movers[row, until]
+            found[row].append(diagnose(touch, map_, mask, *moments, periods_s[row], robot))
         return found
 
 
@@ -100,6 +104,7 @@ def diagnose(
     poses: NDArray[np.floating],
     movers: NDArray[np.float64],
     period_s: float,
+    robot: RobotSettings = PAPER,
 ) -> dict[str, Any]:
     """Say what was hit in a collision, and when it was last sensed.
 
@@ -113,6 +118,7 @@ def diagnose(
         poses: the robot's, from the episode's start to the moment before the step that collided, [T, 3].
         movers: where they were at the same moments, [T, k, 2], m.
         period_s: length of an agent step, s.
+        robot: which one it is.
 
     Returns:
         :data:`COLLISION_COLUMNS`: number of the step, from 0; time since the start; `thing`, a
@@ -122,7 +128,7 @@ def diagnose(
         velocity, a mean over the agent step before. Places and the thing's velocity are in the map frame.
     """
     step = len(poses) - 1
-    time_s = step * period_s + touch.motor_step * MOTOR_PERIOD_S
+    time_s = step * period_s + touch.motor_step * robot.motor_period_s
     x, y, yaw = touch.pose
     bearing = math.remainder(math.atan2(touch.y - y, touch.x - x) - yaw, 2.0 * math.pi)
     discs = _discs(movers, [mover.radius for mover in map_.movers])
@@ -135,7 +141,7 @@ def diagnose(
         thing = "mover"
         velocity = (movers[step, touch.mover] - movers[max(step - 1, 0), touch.mover]) / period_s
         segments, hit_discs = np.empty((0, 4)), discs[:, [touch.mover]]
-    sensed = _last_sensed(segments, hit_discs, map_, discs, mask, poses)
+    sensed = _last_sensed(segments, hit_discs, map_, discs, mask, poses, robot.lidar.max_range_m)
     return {
         "step": step,
         "time_s": time_s,
@@ -220,6 +226,7 @@ def _last_sensed(
     movers: NDArray[np.float64],
     mask: NDArray[np.bool_],
     poses: NDArray[np.floating],
+    max_range_m: float,
 ) -> int | None:
     """Return the last moment at which a thing was sensed; None: never.
 
@@ -230,15 +237,16 @@ def _last_sensed(
         movers: the discs of all movers at each moment, [T, k, 3], m.
         mask: bins that the sensor has, bool [180].
         poses: the robot's, [T, 3].
+        max_range_m: reach of the sensor.
     """
     segments, circles = map_.segments(), map_.circles()
     for moment in range(len(poses) - 1, -1, -1):
         x, y, yaw = poses[moment].tolist()
-        hit_m = sector_distances(x, y, yaw, hit_segments, hit_discs[moment])
+        hit_m = sector_distances(x, y, yaw, hit_segments, hit_discs[moment], max_range_m)
         within = mask & np.isfinite(hit_m)
         if not within.any():
             continue
-        nearest_m = sector_distances(x, y, yaw, segments, np.concatenate([circles, movers[moment]]))
+        nearest_m = sector_distances(x, y, yaw, segments, np.concatenate([circles, movers[moment]]), max_range_m)
         if (within & (hit_m <= nearest_m + _ROUNDING_M)).any():
             return moment
     return None

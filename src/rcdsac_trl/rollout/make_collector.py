@@ -173,6 +173,7 @@ def _collection_policy(
         seed=settings.seed,
         pursuit_iterations=settings.schedule.pursuit_iterations,
         pursuit_noise=settings.schedule.pursuit_noise,
+        robot=settings.robot,
     )
 
 

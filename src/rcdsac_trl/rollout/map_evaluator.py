@@ -16,8 +16,6 @@ from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import ControllerSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
-from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
-from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.beta_control import AdaptivePolicy
 from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
 from rcdsac_trl.rollout.environments import evaluation_worker
@@ -109,7 +107,9 @@ def map_evaluator(
     agent_ids = [*range(spec.num_episodes)] * len(spec.conditions)
     noise = AgentNoise(agent_ids)
     if actor is None:
-        policy = baseline_policy(spec.baseline, sensor=spec.world.sensor, agent_ids=agent_ids, seed=spec.seed)
+        policy = baseline_policy(
+            spec.baseline, sensor=spec.world.sensor, agent_ids=agent_ids, seed=spec.seed, robot=spec.world.robot
+        )
     else:
         policy = _policy(spec, actor, noise)
     planner = policy if isinstance(policy, ControllerPolicy) else None
@@ -161,9 +161,10 @@ def _with_collisions(
 
     rows = drive(map_index, noted)
     recorder.note()  # what the last step led to
-    map_, _ = load_map(spec.world.map_settings, spec.split, spec.seed, map_index)
-    mask = sensor_mask(spec.world.sensor)
-    found = recorder.collisions(map_, mask, _periods_s(spec, map_index).tolist())
+    robot = spec.world.robot
+    map_, _ = load_map(spec.world.map_settings, spec.split, spec.seed, map_index, robot.circumradius_m)
+    mask = robot.sensor_mask(spec.world.sensor)
+    found = recorder.collisions(map_, mask, _periods_s(spec, map_index).tolist(), robot)
     return [row | {COLLISIONS: collisions} for row, collisions in zip(rows, found, strict=True)]
 
 
@@ -180,7 +181,7 @@ def _adaptive(
                 controllers.append(FixedBeta(condition.beta))
             elif condition.controller == "clearance":
                 # What the agent does not see is not among its observations.
-                controllers.append(ClearanceBeta(low, high, near_m=settings.near_m, far_m=settings.far_m))
+                controllers.append(_clearance_beta(low, high, settings, spec))
             else:
                 controllers.append(TailVarianceBeta(low, high, window_steps=settings.window_steps))
     readers = [row for row, controller in enumerate(controllers) if isinstance(controller, TailVarianceBeta)]
@@ -188,12 +189,17 @@ def _adaptive(
     if readers:
         assert loss is not None
         predictor = QuantilePredictor(unpacked_loss(spec.trained, loss).critics, readers)
-    return AdaptivePolicy(policy, controllers, predictor)
+    return AdaptivePolicy(policy, controllers, predictor, spec.world.robot.lidar.max_range_m)
+
+
+def _clearance_beta(low: float, high: float, settings: ControllerSettings, spec: EvaluationSpec) -> ClearanceBeta:
+    return ClearanceBeta(low, high, near_m=settings.near_m, far_m=settings.far_m, robot=spec.world.robot)
 
 
 def _trips(spec: EvaluationSpec, map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:
     """Measure the ways of the episodes on a map."""
-    _, planner = load_map(spec.world.map_settings, spec.split, spec.seed, map_index)
+    world = spec.world
+    _, planner = load_map(world.map_settings, spec.split, spec.seed, map_index, world.robot.circumradius_m)
     return navigation_metrics(episodes, planner, _periods_s(spec, map_index))
 
 
@@ -201,7 +207,9 @@ def _periods_s(spec: EvaluationSpec, map_index: int) -> Tensor:
     """Return the length of an agent step in each episode on a map, ``[N]``, s."""
     agents = range(spec.num_episodes)
     steps = [draw_motor_steps(spec.world.task, spec.split, spec.seed, map_index, agent) for agent in agents]
-    return MOTOR_PERIOD_S * torch.tensor(steps * len(spec.conditions), dtype=torch.float64, device="cpu")
+    return spec.world.robot.motor_period_s * torch.tensor(
+        steps * len(spec.conditions), dtype=torch.float64, device="cpu"
+    )
 
 
 def _policy(spec: EvaluationSpec, actor: bytes, noise: AgentNoise) -> TensorDictModuleBase:

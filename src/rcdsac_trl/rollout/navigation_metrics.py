@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M, segment_clearance
+from rcdsac_trl.world.maps.geometry import segment_clearance
 from rcdsac_trl.world.maps.planner import Planner
 
 TRIP_METRICS = (
@@ -82,4 +82,4 @@ def _first(flags: Tensor) -> int:
 def _smallest_clearance_m(pose: Tensor, planner: Planner) -> float:
     boxes, circles = planner.map.solids()
     nearest = min(segment_clearance(x, y, x, y, boxes, circles, _CLEARANCE_LIMIT_M) for x, y, _ in pose.tolist())
-    return max(float(nearest) - ROBOT_RADIUS_M, 0.0)
+    return max(float(nearest) - planner.robot_radius_m, 0.0)

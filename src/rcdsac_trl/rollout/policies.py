@@ -13,6 +13,7 @@ from torchrl.modules.distributions.utils import safetanh_noeps
 from rcdsac_trl.agent.actor import STATE_KEY
 from rcdsac_trl.agent.kernels.compiled_actor import CompiledActor
 from rcdsac_trl.agent.kernels.dispatch import has_compiled_actor
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.pursuit import pursuit_action
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.system.interrupts import interruption_point
@@ -114,9 +115,13 @@ class PursuitPolicy(TensorDictModuleBase):
     in_keys = ["waypoint"]  # noqa: RUF012 (TensorDictModuleBase's own form)
     out_keys = ["action"]  # noqa: RUF012
 
+    def __init__(self, robot: RobotSettings = PAPER) -> None:
+        super().__init__()
+        self._robot = robot
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`."""
-        return tensordict.set("action", pursuit_action(tensordict["waypoint"]))
+        return tensordict.set("action", pursuit_action(tensordict["waypoint"], self._robot))
 
 
 class CollectionPolicy(TensorDictModuleBase):
@@ -132,6 +137,7 @@ class CollectionPolicy(TensorDictModuleBase):
         seed: root seed.
         pursuit_iterations: first iterations driven by pursuit.
         pursuit_noise: standard deviation of the noise on its actions, a first-order autoregressive process.
+        robot: that is driven.
     """
 
     def __init__(
@@ -142,6 +148,7 @@ class CollectionPolicy(TensorDictModuleBase):
         seed: int,
         pursuit_iterations: int,
         pursuit_noise: float,
+        robot: RobotSettings = PAPER,
     ) -> None:
         super().__init__()
         self.in_keys = policy.in_keys
@@ -151,6 +158,7 @@ class CollectionPolicy(TensorDictModuleBase):
         self.seed = seed
         self.pursuit_iterations = pursuit_iterations
         self.pursuit_noise = pursuit_noise
+        self._robot = robot
         self._pursuing = False
         self._pursuit_draws = AgentNoise(noise.agent_ids)
         self._lasting = torch.zeros((), dtype=torch.float32, device="cpu")
@@ -166,7 +174,7 @@ class CollectionPolicy(TensorDictModuleBase):
         interruption_point()
         tensordict = self.policy(tensordict)
         if self._pursuing:
-            action = pursuit_action(tensordict["waypoint"])
+            action = pursuit_action(tensordict["waypoint"], self._robot)
             noise = self._next_noise(tensordict["is_init"])
             tensordict["action"] = (action + self.pursuit_noise * noise).clamp(-1.0, 1.0)
         return tensordict

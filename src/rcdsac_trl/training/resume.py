@@ -10,6 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcdsac_trl.config.command_line import folder_of, key_of
 from rcdsac_trl.config.compose import compose, output_folder
+from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import CHECKPOINTS, CONFIG_NAME, settings_of_new_run, settings_of_run
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage.checkpoint_record import newest
@@ -128,6 +129,8 @@ def _config(folder: Path) -> dict[str, Any] | None:
 def _comparable(cfg: DictConfig) -> dict[str, Any]:
     values: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     values.pop("resume", None)
+    # Runs of earlier versions name none.
+    values.setdefault("robot", OmegaConf.to_container(OmegaConf.load(CONF_DIR / "robot" / "paper.yaml")))
     if isinstance(maps := values.get("map"), dict):
         maps.pop("sha256", None)  # noted as the run began; whether the files are still those is asked when it goes on
     return values

@@ -17,7 +17,6 @@ from rcdsac_trl.agent.transforms import Mirror
 from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_new_run, settings_of_run, with_map_digests
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.robot.observation import vector_observations
-from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, make_optimizer, make_relabel, packed, parameters
 from rcdsac_trl.rollout.make_collector import make_episodes
 from rcdsac_trl.rollout.map_evaluator import EvaluationSpec, map_evaluator
@@ -90,7 +89,7 @@ def _check_memory(settings: TrainingSettings) -> None:
     learner, others = settings.learner, "or end other programs"
     resources.check_memory("the replay", _replay_bytes(settings), f"lower replay.capacity_steps, {others}")
     observations = learner.batch_size * (learner.sequence_length + 1)
-    batch_bytes = observations * sensor_mask(settings.sensor.name).size * torch.float32.itemsize
+    batch_bytes = observations * settings.sensor_mask.size * torch.float32.itemsize
     resources.check_memory("a mini-batch", batch_bytes, f"lower learner.batch_size, {others}")
     # Those of the training stay while a map is validated.
     simulations = settings.world.num_agents * (1 + len(settings.algo.default_conditions))
@@ -101,7 +100,7 @@ def _check_memory(settings: TrainingSettings) -> None:
 def _replay_bytes(settings: TrainingSettings) -> int:
     algo = settings.algo
     keys = (algo.context_key,) if algo.context_key is not None else ()
-    bins = int(sensor_mask(settings.sensor.name).sum())
+    bins = int(settings.sensor_mask.sum())
     vectors = vector_observations(settings.sensor.memory_s)
     return replay_bytes(settings.replay_steps, settings.task.episode_steps, bins, keys, vectors)
 
@@ -114,7 +113,7 @@ def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
         episode_steps=settings.task.episode_steps,
         sequence_length=settings.learner.sequence_length,
         batch_size=settings.learner.batch_size,
-        sensor_mask=torch.from_numpy(sensor_mask(settings.sensor.name)),
+        sensor_mask=torch.from_numpy(settings.sensor_mask),
         context_keys=(algo.context_key,) if algo.context_key is not None else (),
         vectors=vector_observations(settings.sensor.memory_s),
         seed=settings.seed,
@@ -125,7 +124,7 @@ def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
 def make_learner(settings: TrainingSettings, device: str) -> Learner:
     """Make the networks and all that updates them, with an empty replay."""
     loss = make_loss(settings, device)
-    sensed = torch.from_numpy(sensor_mask(settings.sensor.name))
+    sensed = torch.from_numpy(settings.sensor_mask)
     return Learner(
         replay=make_replay(settings, device),
         mirror=Mirror(sensed, device) if settings.learner.mirror else None,
@@ -187,7 +186,7 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
     settings = settings_of_run(folder, key="resume")
     resources.check_writable(folder)
     settings.collector.check_package()
-    check_maps(settings.map, settings.task.min_path_m)
+    check_maps(settings.map, settings.task.min_path_m, settings.robot.circumradius_m)
     _check_processes(settings)
     _check_memory(settings)
     lock = FolderLock(folder)

@@ -13,8 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M
-from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.shapes import Map
 
 Color = tuple[int, ...]
@@ -56,6 +55,7 @@ class Scene:
         in_contact: whether the robot is in contact.
         remembered: points that the agent is told of because it saw them, [n, 2].
         expected: where it expects what moves, x, y and radius, [k, 3].
+        robot: which one it is.
     """
 
     map: Map
@@ -68,6 +68,7 @@ class Scene:
     in_contact: bool
     remembered: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     expected: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    robot: RobotSettings = PAPER
 
 
 class Renderer:
@@ -255,7 +256,7 @@ def _draw_map(canvas: _Canvas, map_: Map) -> None:
 def _draw_lidar(canvas: _Canvas, scene: Scene) -> None:
     """Fill what the agent sees, and mark each distance over the width of its sector."""
     x, y, yaw = scene.pose
-    reach = np.minimum(scene.distances_m, MAX_RANGE_M)
+    reach = np.minimum(scene.distances_m, scene.robot.lidar.max_range_m)
     width = 2 * math.pi / len(reach)
     first = yaw + width * np.arange(len(reach))
     ends = np.stack([first, first + width])  # [2, n]: both edges of each sector
@@ -263,7 +264,7 @@ def _draw_lidar(canvas: _Canvas, scene: Scene) -> None:
     rim = np.stack([rim_x, rim_y], axis=-1).swapaxes(0, 1)  # [n, 2 edges, 2]
     for run in _runs(scene.sensor_mask):
         canvas.polygon(np.concatenate([[(x, y)], rim[run].reshape(-1, 2)]), SEEN)
-    for index in np.flatnonzero(scene.sensor_mask & (scene.distances_m < MAX_RANGE_M)):
+    for index in np.flatnonzero(scene.sensor_mask & (scene.distances_m < scene.robot.lidar.max_range_m)):
         canvas.line(rim[index], HIT, 0.06)
 
 
@@ -300,12 +301,13 @@ def _draw_path(canvas: _Canvas, scene: Scene) -> None:
 
 def _draw_robot(canvas: _Canvas, scene: Scene) -> None:
     x, y, yaw = scene.pose
-    angles = yaw + np.pi / 4 * (np.arange(8) + 0.5)  # a flat side faces forward
-    outline = np.stack([x + ROBOT_RADIUS_M * np.cos(angles), y + ROBOT_RADIUS_M * np.sin(angles)], axis=-1)
-    if scene.in_contact:
-        canvas.disc(x, y, 0.45, (*TOUCHING, 90))
-    canvas.polygon(outline, TOUCHING if scene.in_contact else ROBOT, ROBOT_EDGE, 0.05)
     ahead, left = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
-    centre = np.array([x, y])
+    centre, corners = np.array([x, y]), scene.robot.outline
+    outline = centre + corners[:, :1] * ahead + corners[:, 1:] * left
+    # Of the paper's robot, whose size the arrow was drawn for.
+    size = scene.robot.inradius_m / PAPER.inradius_m
+    if scene.in_contact:
+        canvas.disc(x, y, scene.robot.circumradius_m + 0.2, (*TOUCHING, 90))
+    canvas.polygon(outline, TOUCHING if scene.in_contact else ROBOT, ROBOT_EDGE, 0.05 * size)
     arrow = [0.17 * ahead, -0.10 * ahead + 0.11 * left, -0.05 * ahead, -0.10 * ahead - 0.11 * left]
-    canvas.polygon(centre + np.array(arrow), (255, 255, 255))
+    canvas.polygon(centre + size * np.array(arrow), (255, 255, 255))

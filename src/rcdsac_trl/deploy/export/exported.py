@@ -23,7 +23,7 @@ from rcdsac_trl.deploy.policy.policy import fractions_of
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, REMEMBERED_SIZE, vector_observations
-from rcdsac_trl.robot.range_sensor import NUM_BINS, sensor_mask
+from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.system.progress import Work
 
 LIMIT = 1e-5
@@ -152,7 +152,7 @@ def _memory(weights: Weights) -> tuple[Array, Array]:
 def _observations(weights: Weights, context: float, steps: int, seed: int) -> Iterator[dict[str, Array]]:
     """Yield the observations of a made-up drive: ranges that come and go, waypoints all around."""
     rng = np.random.default_rng(seed)
-    mask = sensor_mask(weights.config.sensor)
+    mask = weights.config.sensor_mask
     told = np.array([[context]], dtype=np.float32)
     for _ in range(steps):
         bins = rng.uniform(0.5, MAX_RANGE_OBSERVATION, NUM_BINS) * (rng.random(NUM_BINS) < 0.6) * mask
@@ -219,7 +219,7 @@ def _torch_runner(module: Callable[..., tuple[Tensor, Tensor]], names: tuple[str
 
 
 def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Runner]:
-    config, mask = weights.config, sensor_mask(weights.config.sensor)
+    config, mask = weights.config, weights.config.sensor_mask
     critic_encoders = [weights.part(f"critics.{number}.encoder") for number in range(config.num_critics)]
     how = config.padding, config.range_code, config.restart_steps
     own, theirs = Encoders([weights.part("actor.encoder")], mask, *how), Encoders(critic_encoders, mask, *how)

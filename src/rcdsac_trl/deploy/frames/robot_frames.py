@@ -141,7 +141,12 @@ class RobotFrames:
         return robot.pose, pose_s
 
     def sensor(
-        self, frame: str, stamp_s: float, robot_s: float, given: RigidTransform | None, *, may_be_central: bool = False
+        self,
+        frame: str,
+        stamp_s: float,
+        robot_s: float,
+        given: RigidTransform | None,
+        untold: RigidTransform | None = None,
     ) -> RigidTransform:
         """Return where a sensor was at its stamp, in the frame that the robot has at another time.
 
@@ -150,14 +155,13 @@ class RobotFrames:
             stamp_s: of what it measured.
             robot_s: when the robot's frame is meant.
             given: where it sits on the robot; None: as ``/tf`` says.
-            may_be_central: it sits at the robot's centre where nobody publishes any transform.
+            untold: where it sits where nobody publishes any transform; None: that is refused.
 
         Raises:
             TransformError: naming the transform that is missing, or that the robot has moved too far between.
         """
         if given is None:
-            is_central = may_be_central and not self.transforms.frames
-            given = RigidTransform() if is_central else self._mounted(frame, stamp_s)
+            given = self._mounted(frame, stamp_s) if untold is None or self.transforms.frames else untold
         moved = self._robot_at(robot_s).inverse() @ self._robot_at(stamp_s)
         if (metres := math.hypot(*moved.translation_m)) > _LARGEST_MOVE_M:
             raise TransformError(

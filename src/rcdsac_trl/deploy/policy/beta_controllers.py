@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, sensor_mask
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
 Array = NDArray[np.floating]
 
@@ -59,10 +59,11 @@ class ClearanceBeta:
         near_m: from the robot's centre; what is this near is answered by `low`.
         far_m: with nothing within it, the answer is `high`.
         sensor: which sectors count, those that the agent sees.
+        robot: whose range sensor it is.
 
     Raises:
         UserInputError: unless low and high are finite, low is at most high, and near_m below far_m, above 0 and within
-            3 m.
+            the sensor's reach, 3 m.
 
     Example:
         >>> controller = ClearanceBeta(-2.0, 0.0, near_m=0.4, far_m=1.2)
@@ -71,16 +72,23 @@ class ClearanceBeta:
     """
 
     def __init__(
-        self, low: float, high: float, *, near_m: float = 0.4, far_m: float = 1.2, sensor: str = "full"
+        self,
+        low: float,
+        high: float,
+        *,
+        near_m: float = 0.4,
+        far_m: float = 1.2,
+        sensor: str = "full",
+        robot: RobotSettings = PAPER,
     ) -> None:
         _check_range(low, high)
         if not 0.0 < near_m < far_m:
             raise UserInputError(f"near_m={near_m:g} and far_m={far_m:g} must be above 0, and near_m below far_m")
-        if near_m > MAX_RANGE_M:
-            raise UserInputError(f"near_m={near_m:g} is beyond the {MAX_RANGE_M:g} m that agents see: give metres")
+        if near_m > (reach_m := robot.lidar.max_range_m):
+            raise UserInputError(f"near_m={near_m:g} is beyond the {reach_m:g} m that agents see: give metres")
         self._betas = low, high
         self._limits_m = near_m, far_m
-        self._mask = sensor_mask(sensor)
+        self._mask = robot.sensor_mask(sensor)
 
     def reset(self) -> None:
         """Do nothing: only what is seen now counts."""

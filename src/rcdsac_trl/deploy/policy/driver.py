@@ -19,7 +19,7 @@ from rcdsac_trl.deploy.ros import messages
 from rcdsac_trl.deploy.sensors.arrays import described
 from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
 from rcdsac_trl.deploy.sensors.scan import Meaning, Scan, check_meaning
-from rcdsac_trl.deploy.sensors.sectors import Mount, Sectors
+from rcdsac_trl.deploy.sensors.sectors import Mount, Sectors, mount_of_lidar
 from rcdsac_trl.errors import UserInputError
 
 # Of the frames whose clouds are not expected, so many are named.
@@ -54,10 +54,10 @@ class Driver:
 
     Args:
         policy: that drives.
-        mount: where the laser scanner sits; None: as transforms say, at the robot's centre where there are none.
+        mount: where the laser scanner sits; None: as transforms say, or the robot's settings where there are none.
         cameras: pose of each depth camera, by the ``frame_id`` of its clouds; its horizontal field of view alone, rad,
             where transforms say the pose. A frame with "optical" in its name has z ahead, any other x.
-        filter_: which points of clouds are obstacles.
+        filter_: which points of clouds are obstacles; None: the defaults, without what is the robot itself.
         zero_means: what the scanner's driver means by a reading of 0; see :class:`Scan`.
         nan_means: what it means by NaN.
         frames: how the robot's place in the path's frame is known; None for the defaults.
@@ -83,9 +83,11 @@ class Driver:
         self.policy = policy
         self.beta: float | None = None
         self.situation: Situation | None = None
+        self._robot = policy.config.robot
         self._mount = None if mount is None else transform_of_mount(mount)
+        self._own_mount = transform_of_mount(mount_of_lidar(self._robot.lidar))
         self._cameras = dict(cameras or {})
-        self._filter = filter_
+        self._filter = filter_ or CloudFilter(body_radius_m=self._robot.body_radius_m)
         self._meanings = (zero_means, nan_means)
         self._frames = RobotFrames(frames or FrameSettings(), policy.limits.max_age_s)
         self._faults: dict[str, str] = {}
@@ -245,7 +247,7 @@ class Driver:
         if not self._cameras:
             scanned_s = messages.stamp_s(self._scan)
             frame = str(self._scan.header.frame_id)
-            there = self._frames.sensor(frame, scanned_s, pose_s, self._mount, may_be_central=True)
+            there = self._frames.sensor(frame, scanned_s, pose_s, self._mount, self._own_mount)
             return messages.scan_of(self._scan, mount_of(there), *self._meanings), scanned_s
         clouds, stamps = [], []
         for frame, camera in self._cameras.items():
@@ -254,4 +256,4 @@ class Driver:
             given = transform_of_camera(camera) if isinstance(camera, CameraPose) else None
             there = self._frames.sensor(frame, stamps[-1], pose_s, given)
             clouds.append((messages.points_of(message), camera_of(there, camera, frame)))
-        return cloud_sectors(clouds, self._filter), min(stamps)
+        return cloud_sectors(clouds, self._filter, self._robot.lidar.max_range_m), min(stamps)

@@ -7,20 +7,15 @@ obstacle.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.sensors.sectors import Sectors, check_switches
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.limits import (
-    MAX_ANGULAR_ACCELERATION,
-    MAX_ANGULAR_VELOCITY,
-    MAX_LINEAR_ACCELERATION,
-    MAX_LINEAR_VELOCITY,
-    MIN_LINEAR_VELOCITY,
-)
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
 # Shares of the wanted speed that are tried, the fastest first.
 _SHARES = (1.0, 0.75, 0.5, 0.25)
@@ -44,7 +39,6 @@ _LARGEST = {
 }
 # Below, the robot stands.
 _STANDS_M_PER_S = 1e-9
-_TWICE_BRAKING = 2.0 * MAX_LINEAR_ACCELERATION
 
 _ANGLES = np.arange(NUM_BINS) * BIN_RAD
 # Border i is the one between sectors i - 1 and i.
@@ -59,15 +53,20 @@ _BEHIND = np.abs(_MIDDLES) > math.pi - _WAY_RAD
 class Guard:
     """Limits that no command of an agent leaves.
 
+    The defaults are those of the paper's robot; :meth:`of` takes them from another one.
+
     Attributes:
         max_speed_m_per_s: forwards.
         max_reverse_m_per_s: backwards, as a positive number.
         max_turn_rad_per_s: either way.
-        radius_m: of the circle around the robot's centre that holds the robot.
-        margin_m: what is kept between that circle and everything that is sensed. Who is nearer may drive along it
-            or away from it, and nearer by 1 cm a call, the blur of a sector, until 1 cm is left.
+        radius_m: of the circle around the robot's centre that holds the robot. A robot that is not nearly round, such
+            as a rectangle, is guarded by its outline instead, unless this circle is larger than it needs: then it is
+            taken to hold what the robot carries.
+        margin_m: what is kept between that circle, or outline, and everything that is sensed. Who is nearer may drive
+            along it or away from it, and nearer by 1 cm a call, the blur of a sector, until 1 cm is left.
         reaction_s: how long a command may last until the next one arrives and acts.
         blind_reverse: whether the robot may drive backwards (or forwards) where it senses nothing at all.
+        robot: which one it is; how fast it speeds up and brakes, and its outline, count.
 
     Raises:
         UserInputError: if a limit is negative, the radius is not positive, or one is too large for its unit.
@@ -78,13 +77,14 @@ class Guard:
         (0.0, 0.0)
     """
 
-    max_speed_m_per_s: float = MAX_LINEAR_VELOCITY
-    max_reverse_m_per_s: float = -MIN_LINEAR_VELOCITY
-    max_turn_rad_per_s: float = MAX_ANGULAR_VELOCITY
-    radius_m: float = 0.25
+    max_speed_m_per_s: float = PAPER.max_speed_m_per_s
+    max_reverse_m_per_s: float = PAPER.max_reverse_m_per_s
+    max_turn_rad_per_s: float = PAPER.max_angular_velocity
+    radius_m: float = PAPER.circumradius_m
     margin_m: float = 0.05
     reaction_s: float = 0.25
     blind_reverse: bool = False
+    robot: RobotSettings = PAPER
 
     def __post_init__(self) -> None:
         """Refuse what is no limit."""
@@ -99,6 +99,27 @@ class Guard:
                 raise UserInputError(
                     f"{name}={getattr(self, name):g} of the guard is above {largest:.3g}: give metres, seconds, radians"
                 )
+
+    @classmethod
+    def of(cls, robot: RobotSettings, **changes: Any) -> "Guard":
+        """Return the guard of a robot: its limits, its shape.
+
+        Args:
+            robot: which one it is.
+            changes: fields that are to be otherwise.
+
+        Example:
+            >>> from rcdsac_trl.robot.robot_settings import PAPER
+            >>> Guard.of(PAPER, margin_m=0.1) == Guard(margin_m=0.1)
+            True
+        """
+        limits: dict[str, Any] = {
+            "max_speed_m_per_s": robot.max_speed_m_per_s,
+            "max_reverse_m_per_s": robot.max_reverse_m_per_s,
+            "max_turn_rad_per_s": robot.max_angular_velocity,
+            "radius_m": robot.circumradius_m,
+        }
+        return cls(**{**limits, **changes, "robot": robot})
 
     def limit(
         self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float] = (0.0, 0.0)
@@ -135,54 +156,85 @@ class Guard:
         seen = nearest < self._reach(max(abs(v), abs(moving[0])))
         if not np.count_nonzero(seen):
             return 1.0
-        clearance = _distances(self._ways(v, omega, moving), _BORDERS[:, seen], nearest[seen]) - self.radius_m
+        clearance = self._clearances(*self._ways(v, omega, moving), _BORDERS[:, seen], nearest[seen])
         now = float(clearance[0, 0])
         needed = min(self.margin_m, max(now - _BLUR_M, _LEAST_M), now)
         least = clearance.min(axis=1).tolist()
         return next((share for share, left in zip(_SHARES, least, strict=True) if left >= needed), 0.0)
 
+    def _clearances(
+        self,
+        places: NDArray[np.float64],
+        directions: NDArray[np.float64],
+        borders: NDArray[np.float64],
+        nearest: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return how far the robot is from what is sensed at each place, m, [shares, n].
+
+        Args:
+            places: of its centre, [shares, n, 2].
+            directions: cosine and sine of its heading there, [n, 2].
+            borders: directions in which something is, of unit length, [2, m].
+            nearest: how far from here on there may be something, m, [m].
+        """
+        if self.robot.is_round or self.radius_m > self.robot.circumradius_m:
+            return _distances(places, borders, nearest) - self.radius_m
+        return _outline_distances(self.robot.outline, places, directions, borders, nearest)
+
     def _reach(self, speed: float) -> float:
         """Return how near to here, m, something must be to matter to who is never faster than `speed`."""
-        return self.radius_m + self.margin_m + speed * (self.reaction_s + _STEP_S) + speed**2 / _TWICE_BRAKING
+        return (
+            self.radius_m + self.margin_m + speed * (self.reaction_s + _STEP_S) + self.robot.stopping_distance_m(speed)
+        )
 
-    def _ways(self, v: float, omega: float, moving: tuple[float, float]) -> NDArray[np.float64]:
+    def _ways(
+        self, v: float, omega: float, moving: tuple[float, float]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the places the robot's centre comes by until it stands, itself first, for each share of `v`.
 
         Returns:
-            [shares, n, 2], m; who stands before the others do stays where it is.
+            Places [shares, n, 2], m; who stands before the others do stays where it is. And cosine and sine of the
+            heading there, [n, 2], which does not depend on the speed.
         """
         reacting = math.ceil(self.reaction_s / _STEP_S - 1e-9)
-        speeds = [_until_it_stands(share * v, moving[0], reacting) for share in _SHARES]
+        braking, turning = self.robot.max_acceleration_m_per_s2, self.robot.max_angular_acceleration
+        speeds = [_until_it_stands(share * v, moving[0], reacting, braking) for share in _SHARES]
         steps = max(len(of_share) for of_share in speeds)
         covered_m = np.array([of_share + [0.0] * (steps - len(of_share)) for of_share in speeds]) * _STEP_S
         places = np.zeros((len(_SHARES), steps + 1, 2))
-        # The turn does not depend on the speed.
-        np.cumsum(covered_m[:, :, None] * _directions(omega, moving[1], reacting, steps), axis=1, out=places[:, 1:])
-        return places
+        on_the_way, headings = _directions(omega, moving[1], reacting, steps, turning)
+        np.cumsum(covered_m[:, :, None] * on_the_way, axis=1, out=places[:, 1:])
+        return places, headings
 
 
-def _until_it_stands(v: float, now: float, reacting: int) -> list[float]:
+def _until_it_stands(v: float, now: float, reacting: int, acceleration: float) -> list[float]:
     """Return the linear velocity in each step: `v` is wanted in the first ones, and to stand from then on."""
     speeds: list[float] = []
     while len(speeds) < reacting or abs(now) > _STANDS_M_PER_S:
-        now = _nearer(v if len(speeds) < reacting else 0.0, now, MAX_LINEAR_ACCELERATION * _STEP_S)
+        now = _nearer(v if len(speeds) < reacting else 0.0, now, acceleration * _STEP_S)
         speeds.append(now)
     return speeds
 
 
-def _directions(omega: float, now: float, reacting: int, steps: int) -> NDArray[np.float64]:
-    """Return cosine and sine of the mean direction in each step, [steps, 2]; see :func:`_until_it_stands`."""
-    yaw, directions = 0.0, []
+def _directions(
+    omega: float, now: float, reacting: int, steps: int, acceleration: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return directions as cosine and sine: the mean one in each step, [steps, 2], and at its ends, [steps + 1, 2].
+
+    See :func:`_until_it_stands`.
+    """
+    yaw, directions, headings = 0.0, [], [(1.0, 0.0)]
     for step in range(steps):
-        now = _nearer(omega if step < reacting else 0.0, now, MAX_ANGULAR_ACCELERATION * _STEP_S)
+        now = _nearer(omega if step < reacting else 0.0, now, acceleration * _STEP_S)
         half = now * _STEP_S / 2.0
         directions.append((math.cos(yaw + half), math.sin(yaw + half)))
         yaw += 2.0 * half
-    return np.array(directions)
+        headings.append((math.cos(yaw), math.sin(yaw)))
+    return np.array(directions), np.array(headings)
 
 
 def _nearer(wanted: float, now: float, change: float) -> float:
-    """Return the velocity after a step, as ``interface.clip_command`` has it, of one of the two alone."""
+    """Return the velocity after a step, as ``robot.action.clip_command`` has it, of one of the two alone."""
     return now + change if wanted > now + change else now - change if wanted < now - change else wanted
 
 
@@ -204,3 +256,55 @@ def _distances(
     along *= point
     squared = along.min(axis=-1) + np.square(places).sum(axis=-1)
     return np.sqrt(np.maximum(squared, 0.0))
+
+
+def _outline_distances(
+    outline: NDArray[np.float64],
+    places: NDArray[np.float64],
+    headings: NDArray[np.float64],
+    borders: NDArray[np.float64],
+    nearest: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return how far a convex body is from what is sensed at each place, m, [shares, n]; 0 where they meet.
+
+    What is sensed in a direction is everything on the ray from `nearest` on. A ray and a convex body that do not meet
+    are nearest at the ray's beginning, or at one of the body's corners.
+
+    Args:
+        outline: corners of the body in its own frame, counter-clockwise, m, [k, 2].
+        places: of its centre, [shares, n, 2].
+        headings: cosine and sine of its heading there, [n, 2].
+        borders: directions of unit length, [2, m].
+        nearest: in each direction, how far from here on there may be something, m, [m].
+    """
+    cos, sin = headings[:, 0], headings[:, 1]
+    turns = np.stack((np.stack((cos, sin), axis=-1), np.stack((-sin, cos), axis=-1)), axis=1)  # [n, frame, map]
+    corners = places[:, :, None] + outline @ turns
+    at_corners = _distances(corners, borders, nearest).min(axis=-1)
+    # The rays in the body's frame, [shares, n, m, 2].
+    begin = np.einsum("nij,snmj->snmi", turns, (borders * nearest).T - places[:, :, None])
+    along = np.broadcast_to(np.einsum("nij,jm->nmi", turns, borders), begin.shape)
+    at_begin, met = _point_and_ray(outline, begin, along)
+    return np.where(met.any(axis=-1), 0.0, np.minimum(at_corners, at_begin.min(axis=-1)))
+
+
+def _point_and_ray(
+    outline: NDArray[np.float64], begin: NDArray[np.float64], along: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return how far the beginnings of rays [..., 2] are from a convex body, and whether the rays meet it, [...]."""
+    enters, leaves = np.zeros(begin.shape[:-1]), np.full(begin.shape[:-1], np.inf)
+    apart2 = np.full(begin.shape[:-1], np.inf)
+    for corner, following in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        side = following - corner
+        off = begin - corner
+        share = np.clip(off @ side / (side @ side), 0.0, 1.0)
+        apart2 = np.minimum(apart2, np.square(off - share[..., None] * side).sum(axis=-1))
+        # To the left of every side is inside: how far it is there, and how fast the ray gets farther in.
+        inside = side[0] * off[..., 1] - side[1] * off[..., 0]
+        rate = side[0] * along[..., 1] - side[1] * along[..., 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = -inside / rate
+        enters = np.where(rate > 0.0, np.maximum(enters, crossing), enters)
+        leaves = np.where(rate < 0.0, np.minimum(leaves, crossing), leaves)
+        leaves = np.where((rate == 0.0) & (inside < 0.0), -np.inf, leaves)
+    return np.sqrt(apart2), enters <= leaves

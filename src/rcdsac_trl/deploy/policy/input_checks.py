@@ -12,11 +12,14 @@ from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, unsaid_readings
 from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MIN_RANGE_M, WAYPOINT_DISTANCE_LIMITS_M
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
-# Beyond these, a number is in another unit (mm, deg/s) or wrong: robots of this kind drive a third of it.
+# Beyond these, or so many times what the robot can, a number is in another unit (mm, deg/s) or wrong: the paper's robot
+# drives a third of it.
 _FASTEST_M_PER_S = 2.0
 _FASTEST_RAD_PER_S = 2.0 * math.pi
+_FASTER_THAN_IT_CAN = 1.5
 _FARTHEST_RANGE_M = 200.0
 # Something is nearer than this wherever a robot of this kind drives; else distances are in cm, or mm.
 _NEAREST_RANGE_M = 20.0
@@ -124,22 +127,28 @@ def _other_clock(stamp: float, now: float) -> str:
     )
 
 
-def sectors_of(ranges: Any, mask: NDArray[np.bool_], limits: InputLimits) -> Sectors:
+def sectors_of(ranges: Any, mask: NDArray[np.bool_], limits: InputLimits, robot: RobotSettings = PAPER) -> Sectors:
     """Return the sectors of what a range sensor gave, if the agent may drive on them.
 
     Args:
         ranges: distances [180] in m (``inf`` where nothing is), :class:`Sectors`, or a :class:`Scan`.
         mask: the agent's range bins, bool [180].
         limits: how many of them may be lost.
+        robot: whose sensor it is.
 
     Raises:
         BadInputError: if it may not.
     """
-    scan = ranges if isinstance(ranges, Scan) else None
+    scan, reach_m = ranges if isinstance(ranges, Scan) else None, robot.lidar.max_range_m
     if scan is not None:
-        ranges = scan_sectors(scan)
+        ranges = scan_sectors(scan, body_radius_m=robot.body_radius_m, max_range_m=reach_m)
     covered = _EVERYWHERE
     if isinstance(ranges, Sectors):
+        if ranges.max_range_m < reach_m:
+            raise BadInputError(
+                f"sectors were filled up to {ranges.max_range_m:g} m, and robot={robot.name} of this agent sees up to "
+                f"{reach_m:g} m: make them with max_range_m={reach_m:g}"
+            )
         covered, ranges = _covered(ranges), ranges.distances_m
     if (unknown := masked(ranges)) is not None and unknown.shape == covered.shape:
         covered = covered & ~unknown
@@ -147,7 +156,7 @@ def sectors_of(ranges: Any, mask: NDArray[np.bool_], limits: InputLimits) -> Sec
     _check_ranges(distances if covered is _EVERYWHERE else distances[covered])
     if covered is not _EVERYWHERE:
         _check_lost(mask, covered, limits, scan)
-    return Sectors(np.where(covered & (distances < MAX_RANGE_M), distances, math.inf), covered)
+    return Sectors(np.where(covered & (distances < reach_m), distances, math.inf), covered, reach_m)
 
 
 def _covered(sectors: Sectors) -> NDArray[np.bool_]:
@@ -231,8 +240,8 @@ def waypoints_of(waypoints: Any) -> tuple[tuple[float, float], tuple[float, floa
     return (x_1, y_1), (x_2, y_2)
 
 
-def velocity_of(velocity: Any) -> tuple[float, float]:
-    """Return the measured velocities, m/s and rad/s.
+def velocity_of(velocity: Any, robot: RobotSettings = PAPER) -> tuple[float, float]:
+    """Return the measured velocities of a robot, m/s and rad/s.
 
     Raises:
         BadInputError: if they are no such.
@@ -240,10 +249,12 @@ def velocity_of(velocity: Any) -> tuple[float, float]:
     v, omega = _array(velocity, (2,), "velocity").tolist()
     if not (math.isfinite(v) and math.isfinite(omega)):
         raise BadInputError("velocity is not finite: give measured m/s and rad/s")
-    if abs(v) > _FASTEST_M_PER_S or abs(omega) > _FASTEST_RAD_PER_S:
+    fastest = max(_FASTEST_M_PER_S, _FASTER_THAN_IT_CAN * robot.fastest_m_per_s)
+    fastest_turn = max(_FASTEST_RAD_PER_S, _FASTER_THAN_IT_CAN * robot.max_angular_velocity)
+    if abs(v) > fastest or abs(omega) > fastest_turn:
         raise BadInputError(
             f"velocity ({v:g}, {omega:g}) is not in m/s and rad/s: no robot of this kind exceeds "
-            f"{_FASTEST_M_PER_S:g} m/s or {_FASTEST_RAD_PER_S:.2f} rad/s"
+            f"{fastest:g} m/s or {fastest_turn:.2f} rad/s"
         )
     return v, omega
 

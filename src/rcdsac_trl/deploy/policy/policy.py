@@ -1,7 +1,7 @@
 """The object that drives: observations in, a velocity command and the risk of it out, one call a control period."""
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number, is_whol
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
-from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.robot_settings import RobotSettings
 
 if TYPE_CHECKING:
     from rcdsac_trl.robot.remembered_ranges import RememberedRanges
@@ -48,13 +48,31 @@ def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
     return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
 
 
-def _memory_of(memory_s: float, sensed: NDArray[np.bool_]) -> "RememberedRanges | None":
+def _memory_of(memory_s: float, sensed: NDArray[np.bool_], robot: RobotSettings) -> "RememberedRanges | None":
     """Make what remembers for so long, if anything does; alone of all that drives a robot, that needs numba."""
     if memory_s == 0.0:
         return None
     from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 
-    return RememberedRanges(sensed, memory_s)
+    return RememberedRanges(sensed, memory_s, robot)
+
+
+def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> Guard | None:
+    """Return the guard of a robot's policy.
+
+    Raises:
+        UserInputError: if the one that was given is another robot's.
+    """
+    if guard == "robot":
+        return Guard.of(robot)
+    if not isinstance(guard, Guard | None):
+        raise UserInputError(f"guard={guard!r} is none: give Guard.of(robot), None to drive without, or leave it out")
+    if guard is not None and guard.robot != robot:
+        raise UserInputError(
+            f"the guard has the limits of robot={guard.robot.name}, and this agent drives robot={robot.name}: give "
+            "Guard.of(policy.robot, ..), or leave it out"
+        )
+    return guard
 
 
 class Policy:
@@ -65,35 +83,41 @@ class Policy:
 
     Args:
         weights: of the agent, from :func:`rcdsac_trl.deploy.read_weights`.
-        guard: speed limit and stop zone; None drives without, which is for simulations that count collisions.
+        guard: speed limit and stop zone, of its robot: ``Guard.of(robot, ..)``; ``"robot"``: that with its defaults;
+            None drives without, which is for simulations that count collisions.
         limits: how old, and how gappy, input may be.
         num_quantiles: at how many fractions the return's distribution is told.
 
     Attributes:
         config: what the agent is.
+        robot: that it drives.
         fractions: of the quantiles, the midpoints of equal parts of [0, 1], float32 [N].
         default_beta: what ``beta`` is where none is given, the middle of the trained range (-1 for the power law);
             None for an agent that is told none.
+
+    Raises:
+        UserInputError: if the guard is another robot's.
     """
 
     def __init__(
         self,
         weights: Weights,
         *,
-        guard: Guard | None = Guard(),  # noqa: B008 (frozen)
+        guard: Guard | Literal["robot"] | None = "robot",
         limits: InputLimits = InputLimits(),  # noqa: B008 (frozen)
         num_quantiles: int = 16,
     ) -> None:
         self.config = weights.config
-        self.guard = guard
+        self.robot = self.config.robot
+        self.guard = _guard_of(self.robot, guard)
         self.limits = limits
         self.fractions = fractions_of(num_quantiles)
         context = self.config.context_range
         middle = None if context is None else (context[0] + context[1]) / 2.0
         self.default_beta = middle if self.config.context == "beta" else None
         self._default_weight = middle if self.config.context == "collision_weight" else None
-        self._mask = sensor_mask(self.config.sensor)
-        self._remembered = _memory_of(self.config.memory_s, self._mask)
+        self._mask = self.config.sensor_mask
+        self._remembered = _memory_of(self.config.memory_s, self._mask, self.robot)
         parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
         self._encoders = Encoders(
             [weights.part(f"{part}.encoder") for part in parts],
@@ -206,9 +230,9 @@ class Policy:
             if stamps is not None:
                 stamps = as_given_now(stamps)
                 check_stamps(stamps, self._last, self.limits)
-            sectors = sectors_of(ranges, self._mask, self.limits)
+            sectors = sectors_of(ranges, self._mask, self.limits, self.robot)
             next_two = waypoints_of(waypoints)
-            measured = velocity_of(velocity)
+            measured = velocity_of(velocity, self.robot)
             context = self._context(beta, collision_weight)
         except UserInputError as error:
             return self.refuse(str(error))
@@ -264,7 +288,7 @@ class Policy:
         elapsed_s: float,
     ) -> None:
         config = self.config
-        bins = range_observation(sectors.distances_m, self._mask)
+        bins = range_observation(sectors.distances_m, self._mask, self.robot.lidar.max_range_m)
         vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
         if self._remembered is not None:
             vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
@@ -289,7 +313,7 @@ class Policy:
         lower = self._critics.values(memories[1:], action, embedded)
         quantiles = lower if self.config.critic == "quantile" else None
         told = lower.tolist()  # of so few, Python's sum is the fastest mean
-        return Outlook(action, desired_velocities(action.tolist()), quantiles, sum(told) / len(told))
+        return Outlook(action, desired_velocities(action.tolist(), self.robot), quantiles, sum(told) / len(told))
 
     def _command(self, sectors: Sectors, measured: tuple[float, float], fresh: bool, forgot: bool) -> Command:
         assert self._wanted is not None

@@ -25,13 +25,14 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import RangeCode, vector_observations
 from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS, check_memory
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
 FORMAT_VERSION = 4
 """What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
 _UNSAID: dict[int, dict[str, Any]] = {
-    1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", "restart_steps": None},
-    2: {"memory_s": 0.0, "range_code": "paper", "restart_steps": None},
-    3: {"restart_steps": None},
+    1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", "restart_steps": None, "robot": PAPER},
+    2: {"memory_s": 0.0, "range_code": "paper", "restart_steps": None, "robot": PAPER},
+    3: {"restart_steps": None, "robot": PAPER},
     FORMAT_VERSION: {},
 }
 CONFIG_NAME = "config.json"
@@ -73,6 +74,7 @@ class AgentConfig:
         range_code: how its convolutions read a range bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
         restart_steps: its recurrent states restart every so many observations; None: never. See
             :class:`~rcdsac_trl.deploy.policy.inference.Encoders`.
+        robot: that it was trained to drive; plain values of one, as files have them, are read.
 
     Raises:
         UserInputError: if values do not fit together.
@@ -96,9 +98,12 @@ class AgentConfig:
     memory_s: float = 0.0
     range_code: RangeCode = "paper"
     restart_steps: int | None = None
+    robot: RobotSettings = PAPER
 
     def __post_init__(self) -> None:
         """Refuse what no agent can be."""
+        if not isinstance(self.robot, RobotSettings):
+            object.__setattr__(self, "robot", RobotSettings.from_mapping(self.robot))
         for name in ("context_range", "embedding", "period_s"):
             value = getattr(self, name)
             if value is None:
@@ -118,6 +123,7 @@ class AgentConfig:
                 )
         if self.sensor not in SENSORS:
             raise UserInputError(f"sensor={self.sensor!r} does not exist; choose one of {', '.join(sorted(SENSORS))}")
+        self.robot.sensor_mask(self.sensor)
         check_memory(self.memory_s)
         if self.range_code not in get_args(RangeCode):
             raise UserInputError(f"range_code={self.range_code!r} is none of {', '.join(get_args(RangeCode))}")
@@ -135,6 +141,11 @@ class AgentConfig:
             raise UserInputError(f"context={self.context!r} is neither 'beta' nor 'collision_weight' nor null")
         if (self.context is None) != (self.context_range is None) or (self.context == "beta") != bool(self.embedding):
             raise UserInputError("context, context_range and embedding do not fit together")
+
+    @property
+    def sensor_mask(self) -> NDArray[np.bool_]:
+        """Which of the 180 range bins it is told, bool [180]."""
+        return self.robot.sensor_mask(self.sensor)
 
     @property
     def vectors(self) -> dict[str, int]:
@@ -347,6 +358,7 @@ policy = rcdsac_trl.load("this/folder")
 
 | | |
 |---|---|
+| drives | `{config.robot.name}`, {_described(config.robot)} |
 | reads | {NUM_BINS} range bins of which the `{config.sensor}` sensor has some, two waypoints, velocities{remembered} |
 | is told | {told} |
 | risk measure | {config.measure} |
@@ -356,6 +368,15 @@ policy = rcdsac_trl.load("this/folder")
 {driving}
 ## Limits
 
-Trained in simulation only, on a differential-drive robot of 0.25 m radius. It has driven no real robot: keep the
-speed limit and the stop zone on, and a hand on the emergency stop.
+Trained in simulation only, on a differential-drive robot of {config.robot.circumradius_m:.3g} m radius. It has driven
+no real robot: keep the speed limit and the stop zone on, and a hand on the emergency stop.
 """
+
+
+def _described(robot: RobotSettings) -> str:
+    """Say of a robot what somebody compares with the own one."""
+    shape = f"{robot.length_m:g} x {robot.width_m:g} m" if robot.shape == "rectangle" else f"{robot.radius_m:g} m"
+    return (
+        f"{robot.shape} of {shape}, {robot.min_linear_velocity:g} to {robot.max_speed_m_per_s:g} m/s, "
+        f"{robot.max_turn_deg_per_s:g} degrees/s, range sensor up to {robot.lidar.max_range_m:g} m"
+    )

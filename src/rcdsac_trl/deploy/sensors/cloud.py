@@ -120,17 +120,23 @@ class CloudFilter:
             )
 
 
-def cloud_sectors(clouds: Sequence[tuple[ArrayLike, CameraPose]], filter_: CloudFilter | None = None) -> Sectors:
+def cloud_sectors(
+    clouds: Sequence[tuple[ArrayLike, CameraPose]],
+    filter_: CloudFilter | None = None,
+    max_range_m: float = MAX_RANGE_M,
+) -> Sectors:
     """Return what the clouds of several cameras say about each sector.
 
     A cloud cannot say where it saw nothing, so its camera's field of view tells what it covers: the sectors whose
-    farthest points, 3 m from the robot's centre, it has in view. A blind camera covers nothing.
+    farthest points, 3 m from the robot's centre or as far as the agent sees, it has in view. A blind camera
+    covers nothing.
 
     Args:
         clouds: points [n, 3] or [h, w, 3] in the camera's frame, m, and the camera's pose, for each camera; points
             that are not finite or masked are left out, and so is the camera's own place (0, 0, 0), which drivers
             write for pixels without depth.
         filter_: which points are obstacles; None for the defaults.
+        max_range_m: as far as the agent sees.
 
     Raises:
         UserInputError: if points are no [.., 3] array of numbers, or not in metres.
@@ -155,14 +161,14 @@ def cloud_sectors(clouds: Sequence[tuple[ArrayLike, CameraPose]], filter_: Cloud
         x, y, z = (finite @ pose.rotation.T + np.asarray(pose.position_m)).T
         distance = np.hypot(x, y)
         obstacle = (z >= filter_.floor_m) & (z <= filter_.ceiling_m) & (distance >= filter_.body_radius_m)
-        obstacle &= distance < MAX_RANGE_M
+        obstacle &= distance < max_range_m
         bins.append(bins_of(np.arctan2(y[obstacle], x[obstacle])))
         distances.append(distance[obstacle])
-        covered |= _in_view(pose)
+        covered |= _in_view(pose, max_range_m)
     if not bins:
-        return Sectors(np.full(NUM_BINS, np.inf), covered)
-    nearest = nearest_by_sector(np.concatenate(bins), np.concatenate(distances), filter_.support)
-    return Sectors(nearest, covered | np.isfinite(nearest))
+        return Sectors(np.full(NUM_BINS, np.inf), covered, max_range_m)
+    nearest = nearest_by_sector(np.concatenate(bins), np.concatenate(distances), filter_.support, max_range_m)
+    return Sectors(nearest, covered | np.isfinite(nearest), max_range_m)
 
 
 def _measured_points(points: ArrayLike) -> NDArray[np.float64]:
@@ -184,11 +190,11 @@ def _check_unit(points: NDArray[np.float64]) -> None:
         )
 
 
-def _in_view(pose: CameraPose) -> NDArray[np.bool_]:
-    """Return the sectors whose both borders a camera has in view at 3 m from the robot's centre."""
+def _in_view(pose: CameraPose, far_m: float) -> NDArray[np.bool_]:
+    """Return the sectors whose both borders a camera has in view so far from the robot's centre."""
     borders = np.arange(NUM_BINS) * BIN_RAD
-    x = MAX_RANGE_M * np.cos(borders) - pose.position_m[0]
-    y = MAX_RANGE_M * np.sin(borders) - pose.position_m[1]
+    x = far_m * np.cos(borders) - pose.position_m[0]
+    y = far_m * np.sin(borders) - pose.position_m[1]
     off = np.arctan2(y, x) - pose.heading_rad
     seen = np.abs((off + math.pi) % (2.0 * math.pi) - math.pi) <= pose.view_rad / 2.0
     return seen & np.roll(seen, -1)

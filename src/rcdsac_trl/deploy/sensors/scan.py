@@ -91,7 +91,7 @@ def check_meaning(name: str, value: object) -> None:
         raise UserInputError(f"{name}={value!r} is none of {', '.join(get_args(Meaning))}: choose one")
 
 
-def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors:
+def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_m: float = MAX_RANGE_M) -> Sectors:
     """Return what a scan says about each sector.
 
     A sector is covered if at least one ray points into it and at least half of those that do say something. Points
@@ -101,10 +101,11 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors
     Args:
         scan: of any angle range and direction.
         body_radius_m: what is nearer to the robot's centre is the robot, and such a ray says nothing.
+        max_range_m: as far as the agent sees.
 
     Raises:
         UserInputError: if the scan cannot be one: no ray, an increment of 0, angles in degrees, limits that are no
-            numbers, a sensor that does not reach the 3 m that agents see, or readings that are not in metres.
+            numbers, a sensor that does not reach as far as the agent sees, or readings that are not in metres.
 
     Example:
         >>> scan = Scan(np.full(360, 2.0), -math.pi, math.radians(1.0), 0.1, 10.0)
@@ -112,7 +113,7 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors
         >>> float(sectors.distances_m.max()), bool(sectors.covered.all())
         (2.0, True)
     """
-    ranges = _checked(scan)
+    ranges = _checked(scan, max_range_m)
     with np.errstate(invalid="ignore"):
         for readings, meaning in ((ranges == 0.0, scan.zero_means), (np.isnan(ranges), scan.nan_means)):
             ranges = np.where(readings, _STANDS_FOR[meaning], ranges)
@@ -133,9 +134,9 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M) -> Sectors
     silent[np.flatnonzero(hits)[own]] = True
     rays, saying = (np.bincount(bearings[which], minlength=NUM_BINS) for which in (slice(None), ~silent))
     covered = (saying > 0) & (2 * saying >= rays)
-    nearest = nearest_by_sector(bins[~own], distances[~own])
+    nearest = nearest_by_sector(bins[~own], distances[~own], max_range_m=max_range_m)
     # Something that is seen is seen, whatever the other rays of its sector say.
-    return Sectors(nearest, covered | np.isfinite(nearest))
+    return Sectors(nearest, covered | np.isfinite(nearest), max_range_m)
 
 
 def unsaid_readings(scan: Scan) -> dict[str, int]:
@@ -148,7 +149,7 @@ def unsaid_readings(scan: Scan) -> dict[str, int]:
     }
 
 
-def _checked(scan: Scan) -> NDArray[np.float64]:
+def _checked(scan: Scan, max_range_m: float) -> NDArray[np.float64]:
     ranges = numbers_of(scan.ranges, "the scan's ranges")
     if ranges.ndim != 1 or not 0 < len(ranges) <= _MOST_RAYS:
         raise UserInputError(f"the scan's ranges have shape {list(ranges.shape)}: give one number for each ray")
@@ -157,7 +158,7 @@ def _checked(scan: Scan) -> NDArray[np.float64]:
     check_meaning("zero_means", scan.zero_means)
     check_meaning("nan_means", scan.nan_means)
     _check_angles(scan, len(ranges))
-    _check_limits(scan)
+    _check_limits(scan, max_range_m)
     _check_unit(ranges, scan)
     return ranges
 
@@ -182,19 +183,19 @@ def _check_angles(scan: Scan, rays: int) -> None:
         )
 
 
-def _check_limits(scan: Scan) -> None:
+def _check_limits(scan: Scan, max_range_m: float) -> None:
     if not is_finite_number(scan.range_min):
         raise UserInputError("the scan's range_min is no finite number: check the driver")
     if not (is_finite_number(scan.range_max) or scan.range_max == math.inf):
         raise UserInputError("the scan's range_max is no number (inf is one): check the driver")
-    if not 0.0 <= scan.range_min < scan.range_max or scan.range_max < MAX_RANGE_M:
+    if not 0.0 <= scan.range_min < scan.range_max or scan.range_max < max_range_m:
         raise UserInputError(
-            f"the scan measures {scan.range_min:g} to {scan.range_max:g} m, agents see up to {MAX_RANGE_M:g} m: use "
+            f"the scan measures {scan.range_min:g} to {scan.range_max:g} m, agents see up to {max_range_m:g} m: use "
             "a sensor that reaches so far"
         )
-    if scan.range_min >= MAX_RANGE_M:
+    if scan.range_min >= max_range_m:
         raise UserInputError(
-            f"the scan measures from range_min={scan.range_min:g} m on, agents see only up to {MAX_RANGE_M:g} m: give "
+            f"the scan measures from range_min={scan.range_min:g} m on, agents see only up to {max_range_m:g} m: give "
             "its limits in metres"
         )
 

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS, LidarSettings
+from rcdsac_trl.robot.robot_settings import PAPER
 
-BODY_RADIUS_M = 0.2
-"""What is nearer to the robot's centre is the robot itself: nothing else gets inside an octagon of 0.25 m, whose sides
-are 0.23 m away."""
+BODY_RADIUS_M = PAPER.body_radius_m
+"""What is nearer to the paper's robot's centre, 0.2 m, is the robot itself: nothing else gets inside an octagon of
+0.25 m, whose sides are 0.23 m away."""
 
 _NUMBER = int | float | np.integer | np.floating
 _NO_NUMBER = bool | np.timedelta64  # which Python, and NumPy, count among the integers
@@ -27,12 +28,14 @@ class Sectors:
 
     Attributes:
         distances_m: smallest distance from the robot's centre to anything in the sector, ``inf`` where nothing is
-            within 3 m, float64 [180].
+            within reach, float64 [180].
         covered: whether the sensor can say anything about the sector, bool [180]; elsewhere the distance is ``inf``.
+        max_range_m: that reach: what is farther was left out.
     """
 
     distances_m: NDArray[np.float64]
     covered: NDArray[np.bool_]
+    max_range_m: float = MAX_RANGE_M
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,11 @@ class Mount:
             raise UserInputError(f"yaw_rad={self.yaw_rad:g} of a sensor is more than a full turn: give radians")
 
 
+def mount_of_lidar(lidar: LidarSettings) -> Mount:
+    """Return where a robot's own sensor sits."""
+    return Mount(lidar.x_m, lidar.y_m, math.radians(lidar.yaw_deg))
+
+
 def is_finite_number(value: object) -> bool:
     """Tell whether something is one finite number, whatever it may be."""
     try:
@@ -95,16 +103,20 @@ def bins_of(angles_rad: NDArray[np.floating]) -> NDArray[np.intp]:
 
 
 def nearest_by_sector(
-    bins: NDArray[np.intp], distances_m: NDArray[np.float64], support: int = 1
+    bins: NDArray[np.intp],
+    distances_m: NDArray[np.float64],
+    support: int = 1,
+    max_range_m: float = MAX_RANGE_M,
 ) -> NDArray[np.float64]:
-    """Return the smallest distance in each sector, ``inf`` where nothing is within 3 m, float64 [180].
+    """Return the smallest distance in each sector, ``inf`` where nothing is within reach, float64 [180].
 
     Args:
         bins: sector of each point, [n].
         distances_m: of each point, [n].
         support: this many points must be at least as near: 1 is the exact minimum, more ignores single outliers.
+        max_range_m: that reach.
     """
-    near = distances_m < MAX_RANGE_M
+    near = distances_m < max_range_m
     bins, distances_m = bins[near], distances_m[near]
     nearest = np.full(NUM_BINS, np.inf)
     if support == 1:

@@ -12,7 +12,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered
 from rcdsac_trl.evaluation.course.course_drive import Pilot
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
-from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.robot_settings import PAPER
 
 # What the paper's second table sets each measure to.
 _PAPER_BETAS = {"cvar": (0.25, 0.75), "pow": (-2.0, -1.0)}
@@ -55,9 +55,14 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
             raise UserInputError(
                 "no agent is shipped with this version: name who drives with run=<folder> or baseline=pursuit"
             )
-    guard = None if settings.guard_margin_m is None else Guard(margin_m=settings.guard_margin_m)
-    policies = {run: rcdsac_trl.load(run, guard=guard) for run in runs}
+    policies = {run: rcdsac_trl.load(run, guard=None) for run in runs}
     for run, policy in policies.items():
+        if policy.robot != PAPER:
+            raise UserInputError(
+                f"run={run} drives robot={policy.robot.name}, and the course is the paper's robot's: name an agent of "
+                "robot=paper"
+            )
+        policy.guard = None if settings.guard_margin_m is None else Guard(margin_m=settings.guard_margin_m)
         _check_sensor(run, policy, settings.camera.view_deg)
     conditioned = [run for run, policy in policies.items() if policy.config.context == "beta"]
     if settings.beta is not None and not conditioned:
@@ -86,7 +91,7 @@ def _of_policy(run: str, policy: Policy, betas: Sequence[float] | None) -> list[
 
 def _check_sensor(run: str, policy: Policy, view_deg: float) -> None:
     """Refuse an agent that the cameras leave in the dark; its policy would only stand."""
-    mask = sensor_mask(policy.config.sensor)
+    mask = policy.config.sensor_mask
     lost = np.count_nonzero(mask & ~covered(camera_poses(view_deg))) / np.count_nonzero(mask)
     if lost > InputLimits().max_lost_share:
         raise UserInputError(

@@ -13,7 +13,6 @@ from rcdsac_trl.evaluation.film.episode_film import Track, film
 from rcdsac_trl.evaluation.film.recording import Moment, Recorder
 from rcdsac_trl.evaluation.film.trajectories import trajectories
 from rcdsac_trl.evaluation.film.video import write_video
-from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.rollout.make_agent import unpacked_loss
 from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
@@ -46,7 +45,7 @@ def write_film(
     named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]
     name = f"map{video.map}-episode{video.episode}"
     with Work(f"a film of {len(tracks[0])} steps", 1, "film") as work:
-        frames = work.within(film(named, motor_steps * MOTOR_PERIOD_S), len(tracks[0]))
+        frames = work.within(film(named, motor_steps * spec.world.robot.motor_period_s), len(tracks[0]))
         films = write_video(frames, folder / f"video-{name}", video.fps)
     picture = io.BytesIO()
     Image.fromarray(trajectories(named)).save(picture, "png", optimize=True)

@@ -4,6 +4,7 @@ import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,19 +13,25 @@ from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import waypoint_observation
-from rcdsac_trl.robot.range_sensor import NUM_BINS, sensor_mask
+from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
 from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
 from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
 from rcdsac_trl.rollout.policies import PursuitPolicy
 
 PURSUIT = "pursuit"
-_PLANNERS: Mapping[str, Callable[[], Controller]] = {"dwa": Dwa, "mppi": Mppi}
+_PLANNERS: Mapping[str, Callable[[RobotSettings], Controller]] = {
+    "dwa": lambda robot: Dwa(robot=robot),
+    "mppi": lambda robot: Mppi(robot=robot),
+}
 _SETTINGS: Mapping[str, Callable[[], Any]] = {"dwa": DwaSettings, "mppi": MppiSettings}
 _OWN = re.compile(r"(?P<module>\w+(\.\w+)*):(?P<name>\w+)")
 
 
-def baseline_policy(name: str, *, sensor: str, agent_ids: Sequence[int], seed: int) -> TensorDictModuleBase:
+def baseline_policy(
+    name: str, *, sensor: str, agent_ids: Sequence[int], seed: int, robot: RobotSettings = PAPER
+) -> TensorDictModuleBase:
     """Return the policy of a baseline.
 
     Args:
@@ -33,23 +40,24 @@ def baseline_policy(name: str, *, sensor: str, agent_ids: Sequence[int], seed: i
         sensor: one of :data:`rcdsac_trl.robot.range_sensor.SENSORS`.
         agent_ids: numbers of the agents.
         seed: root seed of what is random.
+        robot: that it drives.
 
     Raises:
         UserInputError: if there is no such baseline.
     """
     if name == PURSUIT:
-        return PursuitPolicy()
-    make = _PLANNERS.get(name) or _own_class(name)
-    return ControllerPolicy(make, name, sensor_mask(sensor), agent_ids, seed)
+        return PursuitPolicy(robot)
+    make = partial(_PLANNERS[name], robot) if name in _PLANNERS else _own_class(name)
+    return ControllerPolicy(make, name, robot.sensor_mask(sensor), agent_ids, seed, robot)
 
 
-def check_baseline(name: str, sensor: str) -> None:
+def check_baseline(name: str, sensor: str, robot: RobotSettings = PAPER) -> None:
     """Refuse a baseline that cannot drive: let it drive one step with nothing around.
 
     Raises:
         UserInputError: if there is no such baseline, it cannot be made, or it answers no two velocities.
     """
-    policy = baseline_policy(name, sensor=sensor, agent_ids=[0], seed=0)
+    policy = baseline_policy(name, sensor=sensor, agent_ids=[0], seed=0, robot=robot)
     if name == PURSUIT or name in _PLANNERS:
         return
     ahead = waypoint_observation((0.0, 0.0, 0.0), (5.0, 0.0), (5.0, 0.0))

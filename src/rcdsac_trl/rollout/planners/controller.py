@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import range_distances, waypoint_positions
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.seeding import stream
 
 
@@ -20,7 +21,7 @@ class Controller(Protocol):
     """Drives one robot with what an agent is told, decoded to metres: no pose, no map.
 
     A class whose objects are made without arguments and have these two methods can be evaluated with
-    ``baseline=<module>:<class>``.
+    ``baseline=<module>:<class>``. Limits and sizes of the robot that it drives it has to know itself.
     """
 
     def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
@@ -39,7 +40,7 @@ class Controller(Protocol):
         """Return the desired velocities: linear in m/s and angular in rad/s; what is beyond the robot's is clipped.
 
         Args:
-            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m and
+            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is in reach and
                 where the sensor has no sector.
             waypoints_m: the next two waypoints, float64 [2, 2], x ahead and y to the left, m; both are the goal on
                 the last leg.
@@ -57,6 +58,7 @@ class ControllerPolicy(TensorDictModuleBase):
         sensed: which of the 180 sectors the sensor has, bool [180].
         agent_ids: numbers of the agents, in the order of the flattened batch.
         seed: root seed; agent j on map i draws from the stream (seed, name, i, j).
+        robot: that is driven.
 
     Example:
         >>> from tensordict import TensorDict
@@ -80,9 +82,11 @@ class ControllerPolicy(TensorDictModuleBase):
         sensed: NDArray[np.bool_],
         agent_ids: Sequence[int],
         seed: int,
+        robot: RobotSettings = PAPER,
     ) -> None:
         super().__init__()
         self._name = name
+        self._robot = robot
         self._sensed = sensed
         self._agent_ids = tuple(agent_ids)
         self._seed = seed
@@ -104,7 +108,7 @@ class ControllerPolicy(TensorDictModuleBase):
             value = tensordict.get(key)
             return value.reshape(-1, value.shape[-1]).numpy()
 
-        ranges_m = range_distances(rows("range"))
+        ranges_m = range_distances(rows("range"), self._robot.lidar.max_range_m)
         waypoints_m = waypoint_positions(rows("waypoint"))
         velocities = rows("velocity").astype(np.float64)
         is_init = rows("is_init")[:, 0]
@@ -126,4 +130,4 @@ class ControllerPolicy(TensorDictModuleBase):
                 f"baseline={self._name} answered {answer!r}: act() must return the desired velocities, two finite "
                 "numbers in m/s and rad/s"
             )
-        return action_of(v, omega)
+        return action_of(v, omega, self._robot)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.trajectory_costs import PlannerSettings, TrajectoryCosts
 
 
@@ -44,19 +44,21 @@ class Dwa:
 
     Args:
         settings: what it looks at.
+        robot: that it drives.
     """
 
-    def __init__(self, settings: DwaSettings | None = None) -> None:
+    def __init__(self, settings: DwaSettings | None = None, robot: RobotSettings = PAPER) -> None:
         self.settings = settings or DwaSettings()
-        v = np.linspace(MIN_LINEAR_VELOCITY, MAX_LINEAR_VELOCITY, self.settings.linear)
-        omega = np.linspace(-MAX_ANGULAR_VELOCITY, MAX_ANGULAR_VELOCITY, self.settings.angular)
+        self._robot = robot
+        v = np.linspace(robot.min_linear_velocity, robot.max_speed_m_per_s, self.settings.linear)
+        omega = np.linspace(-robot.max_angular_velocity, robot.max_angular_velocity, self.settings.angular)
         self._pairs = np.stack(np.meshgrid(v, omega, indexing="ij"), axis=-1).reshape(-1, 2)
         self._controls = np.repeat(self._pairs[:, None], self.settings.steps, axis=1)
 
     def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
         """Begin an episode, and forget the last one; nothing is random."""
         settings = self.settings
-        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps)
+        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps, self._robot)
 
     def act(
         self, ranges_m: NDArray[np.float64], waypoints_m: NDArray[np.float64], velocity: NDArray[np.float64]

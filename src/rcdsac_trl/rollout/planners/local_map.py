@@ -69,6 +69,7 @@ class LocalMap:
     Args:
         settings: what it holds.
         sensed: which of the 180 sectors the sensor has, bool [180].
+        max_range_m: reach of the sensor.
 
     Attributes:
         pose: the robot's x and y in m and yaw in rad, float64 [3], odometry frame.
@@ -87,8 +88,9 @@ class LocalMap:
         0.5
     """
 
-    def __init__(self, settings: LocalMapSettings, sensed: NDArray[np.bool_]) -> None:
+    def __init__(self, settings: LocalMapSettings, sensed: NDArray[np.bool_], max_range_m: float = MAX_RANGE_M) -> None:
         self.settings = settings
+        self._max_range_m = max_range_m
         self.sensed = np.asarray(sensed, np.bool_)
         n = settings.num_cells
         self._reckoning = DeadReckoning()
@@ -120,14 +122,15 @@ class LocalMap:
         """Forget what is old, clear what is seen through, and add what is seen but does not move.
 
         Args:
-            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is within 3 m.
+            ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is in reach.
             moving: what moves, float64 [k, 6]; see :attr:`rcdsac_trl.robot.mover_tracks.MoverTracks.moving`.
         """
         settings = self.settings
         _forget(self.points, self._reckoning.time_s - settings.memory_s, self.pose, 0.5 * settings.size_m)
-        _clear(self.points, self.pose, ranges_m, self.sensed, settings.clearing_margin_m)
-        _add(self.points, self._reckoning.time_s, self.pose, ranges_m, self.sensed, settings.cell_m)
-        _take_out(self.points, self._reckoning.time_s, moving, settings.mover_margin_m)
+        time_s, far_m = self._reckoning.time_s, self._max_range_m
+        _clear(self.points, self.pose, ranges_m, self.sensed, settings.clearing_margin_m, far_m)
+        _add(self.points, time_s, self.pose, ranges_m, self.sensed, settings.cell_m, far_m)
+        _take_out(self.points, time_s, moving, settings.mover_margin_m)
         _measure(self.field_m, self.points, self.pose, settings.cell_m, settings.reach_m)
 
     @property
@@ -160,8 +163,10 @@ def _forget(points: np.ndarray, before_s: float, pose: np.ndarray, half_m: float
 
 
 @njit
-def _clear(points: np.ndarray, pose: np.ndarray, ranges_m: np.ndarray, sensed: np.ndarray, margin_m: float) -> None:
-    """Drop what sectors see through: nothing is nearer than their range, and nothing within 3 m where there is none."""
+def _clear(
+    points: np.ndarray, pose: np.ndarray, ranges_m: np.ndarray, sensed: np.ndarray, margin_m: float, far_m: float
+) -> None:
+    """Drop what sectors see through: nothing is nearer than their range, and nothing in reach where there is none."""
     for i in range(points.shape[0]):
         for j in range(points.shape[1]):
             if points[i, j, 2] == _NEVER:
@@ -169,7 +174,7 @@ def _clear(points: np.ndarray, pose: np.ndarray, ranges_m: np.ndarray, sensed: n
             dx, dy = points[i, j, 0] - pose[0], points[i, j, 1] - pose[1]
             bearing = math.atan2(dy, dx) - pose[2]
             bin_ = math.floor(bearing / BIN_RAD) % NUM_BINS
-            if sensed[bin_] and math.hypot(dx, dy) < min(ranges_m[bin_], MAX_RANGE_M) - margin_m:
+            if sensed[bin_] and math.hypot(dx, dy) < min(ranges_m[bin_], far_m) - margin_m:
                 points[i, j, 2] = _NEVER
 
 
@@ -183,12 +188,18 @@ def _put(points: np.ndarray, x: float, y: float, time_s: float, cell_m: float) -
 
 @njit
 def _add(
-    points: np.ndarray, time_s: float, pose: np.ndarray, ranges_m: np.ndarray, sensed: np.ndarray, cell_m: float
+    points: np.ndarray,
+    time_s: float,
+    pose: np.ndarray,
+    ranges_m: np.ndarray,
+    sensed: np.ndarray,
+    cell_m: float,
+    far_m: float,
 ) -> None:
     """Put a point into the middle of each sector that sees one."""
     half_m = 0.5 * points.shape[0] * cell_m
     for bin_ in range(NUM_BINS):
-        if not sensed[bin_] or ranges_m[bin_] >= MAX_RANGE_M:
+        if not sensed[bin_] or ranges_m[bin_] >= far_m:
             continue
         bearing = pose[2] + (bin_ + 0.5) * BIN_RAD
         dx, dy = ranges_m[bin_] * math.cos(bearing), ranges_m[bin_] * math.sin(bearing)

@@ -7,20 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.trajectory_costs import PlannerSettings, TrajectoryCosts
 from rcdsac_trl.system.jit import njit
 
-# Among the samples, held from the first step to the last: stand, turn left, turn right, drive on, back out.
-_HELD = np.array(
-    [
-        (0.0, 0.0),
-        (0.0, MAX_ANGULAR_VELOCITY),
-        (0.0, -MAX_ANGULAR_VELOCITY),
-        (MAX_LINEAR_VELOCITY, 0.0),
-        (MIN_LINEAR_VELOCITY, 0.0),
-    ]
-)
+# Samples that are held from the first step to the last; see :func:`_held`.
+_NUM_HELD = 5
 
 
 @dataclass(frozen=True)
@@ -54,8 +46,8 @@ class MppiSettings:
 
     def __post_init__(self) -> None:
         """Refuse what samples nothing."""
-        if self.samples <= len(_HELD) + 1:
-            raise UserInputError(f"samples={self.samples} must be above {len(_HELD) + 1}: those are not random")
+        if self.samples <= _NUM_HELD + 1:
+            raise UserInputError(f"samples={self.samples} must be above {_NUM_HELD + 1}: those are not random")
         for name in ("steps", "knot_steps", "std_v", "std_omega", "temperature_m"):
             if not getattr(self, name) > 0:
                 raise UserInputError(f"{name}={getattr(self, name)} must be above 0")
@@ -69,16 +61,20 @@ class Mppi:
 
     Args:
         settings: what it looks at.
+        robot: that it drives.
     """
 
-    def __init__(self, settings: MppiSettings | None = None) -> None:
+    def __init__(self, settings: MppiSettings | None = None, robot: RobotSettings = PAPER) -> None:
         self.settings = settings or MppiSettings()
+        self._robot = robot
+        self._held = _held(robot)
+        self._limits = robot.min_linear_velocity, robot.max_speed_m_per_s, robot.max_angular_velocity
         self._knots = (self.settings.steps - 1) // self.settings.knot_steps + 2
 
     def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
         """Begin an episode, and forget the last one."""
         settings = self.settings
-        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps)
+        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps, self._robot)
         self._rng = rng
         self._plan = np.zeros((settings.steps, 2))
 
@@ -91,18 +87,34 @@ class Mppi:
         noise = self._rng.standard_normal((settings.samples, self._knots, 2), np.float32)
         controls = np.empty((settings.samples, settings.steps, 2))
         self._plan[:-1] = self._plan[1:]
-        _scatter(controls, self._plan, noise, settings.knot_steps, settings.std_v, settings.std_omega)
+        _scatter(controls, self._plan, noise, settings.knot_steps, settings.std_v, settings.std_omega, *self._limits)
         controls[0] = self._plan
-        controls[1 : 1 + len(_HELD)] = _HELD[:, None]
+        controls[1 : 1 + _NUM_HELD] = self._held[:, None]
         _average(self._plan, controls, self._costs.of(controls), settings.temperature_m)
         v, omega = self._plan[0].tolist()
         return v, omega
 
 
+def _held(robot: RobotSettings) -> NDArray[np.float64]:
+    """Return the velocities of simple ways, [5, 2]: stand, turn left, turn right, drive on, back out."""
+    turn = robot.max_angular_velocity
+    return np.array(
+        [(0.0, 0.0), (0.0, turn), (0.0, -turn), (robot.max_speed_m_per_s, 0.0), (robot.min_linear_velocity, 0.0)]
+    )
+
+
 # ------------------------------------------------------------------------------------------------ compiled
 @njit
 def _scatter(
-    controls: np.ndarray, plan: np.ndarray, noise: np.ndarray, knot_steps: int, std_v: float, std_omega: float
+    controls: np.ndarray,
+    plan: np.ndarray,
+    noise: np.ndarray,
+    knot_steps: int,
+    std_v: float,
+    std_omega: float,
+    min_v: float,
+    max_v: float,
+    max_omega: float,
 ) -> None:
     """Write a plan with noise, linear from knot to knot, within the robot's velocities."""
     for k in range(controls.shape[0]):
@@ -111,8 +123,8 @@ def _scatter(
             share = (t - knot * knot_steps) / knot_steps
             v = plan[t, 0] + std_v * ((1.0 - share) * noise[k, knot, 0] + share * noise[k, knot + 1, 0])
             omega = plan[t, 1] + std_omega * ((1.0 - share) * noise[k, knot, 1] + share * noise[k, knot + 1, 1])
-            controls[k, t, 0] = min(max(v, MIN_LINEAR_VELOCITY), MAX_LINEAR_VELOCITY)
-            controls[k, t, 1] = min(max(omega, -MAX_ANGULAR_VELOCITY), MAX_ANGULAR_VELOCITY)
+            controls[k, t, 0] = min(max(v, min_v), max_v)
+            controls[k, t, 1] = min(max(omega, -max_omega), max_omega)
 
 
 @njit

@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.limits import DEAD_BAND, MAX_ANGULAR_ACCELERATION, MAX_LINEAR_ACCELERATION, MAX_LINEAR_VELOCITY
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.cost_to_go import cost_to_go
 from rcdsac_trl.rollout.planners.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.system.jit import njit
-from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE, TaskSettings
 
 PERIOD_S = 0.14
-"""The mean control period; the real one, 0.12 to 0.16 s, an agent is not told."""
+"""The mean control period of the paper's task; the real one, 0.12 to 0.16 s, an agent is not told."""
 
 # Waypoints nearer to each other are one: the goal.
 _SAME_M = 1e-3
@@ -76,8 +75,9 @@ class CostSettings:
                 raise UserInputError(f"{each.name}={value} must be a positive number")
 
 
-# The settings as compiled code reads them.
+# The settings, and what counts of a robot, as compiled code reads them.
 _Weights: Any = namedtuple("_Weights", [each.name for each in fields(CostSettings)])  # type: ignore[misc]
+_Robot: Any = namedtuple("_Robot", ["radius_m", "speed", "acceleration", "turn_acceleration", "dead_band", "per_turn"])
 
 
 @dataclass(frozen=True)
@@ -102,22 +102,33 @@ class TrajectoryCosts:
         settings: what it remembers and what counts.
         sensed: which of the 180 sectors the sensor has, bool [180].
         steps: of the trajectories, :data:`PERIOD_S` each.
+        robot: that drives; its circumcircle stands for it.
 
     Attributes:
         local_map: what stands.
         tracks: what moves.
     """
 
-    def __init__(self, settings: PlannerSettings, sensed: NDArray[np.bool_], steps: int) -> None:
-        self.local_map = LocalMap(settings.local_map, sensed)
-        self.tracks = MoverTracks(settings.tracks, sensed)
+    def __init__(
+        self, settings: PlannerSettings, sensed: NDArray[np.bool_], steps: int, robot: RobotSettings = PAPER
+    ) -> None:
+        self.local_map = LocalMap(settings.local_map, sensed, robot.lidar.max_range_m)
+        self.tracks = MoverTracks(settings.tracks, sensed, robot.lidar.max_range_m)
+        self._robot = _Robot(
+            robot.circumradius_m,
+            robot.max_speed_m_per_s,
+            robot.max_acceleration_m_per_s2,
+            robot.max_angular_acceleration,
+            robot.dead_band,
+            robot.reward_per_turn,
+        )
         self._weights = _Weights(*map(float, astuple(settings.cost)))
         self._cell_m = _COARSER * settings.local_map.cell_m
         n = settings.local_map.num_cells // _COARSER
         self._prices = np.zeros((n, n))
         self._ways = np.zeros((2, n, n))
         self._waypoints = np.zeros((2, 2))
-        self._reach_m = MAX_LINEAR_VELOCITY * PERIOD_S * steps + settings.cost.waypoint_radius_m
+        self._reach_m = robot.max_speed_m_per_s * PERIOD_S * steps + settings.cost.waypoint_radius_m
         self._state = 0.0, 0.0, 0.0, 0.0, 0.0
         self._moving = self.tracks.moving
         self._elapsed_s = 0.0
@@ -130,7 +141,7 @@ class TrajectoryCosts:
         local_map = self.local_map
         local_map.move(v, omega, self._elapsed_s)
         if stalled := self._stalled(*velocity.tolist()):
-            local_map.touch(math.copysign(ROBOT_RADIUS_M, stalled))
+            local_map.touch(math.copysign(self._robot.radius_m, stalled))
         self.tracks.observe(ranges_m, local_map.pose, self._elapsed_s)
         self._moving = self.tracks.moving
         local_map.observe(ranges_m, self._moving)
@@ -140,7 +151,7 @@ class TrajectoryCosts:
         cos, sin = math.cos(yaw), math.sin(yaw)
         self._waypoints[:, 0] = x + cos * waypoints_m[:, 0] - sin * waypoints_m[:, 1]
         self._waypoints[:, 1] = y + sin * waypoints_m[:, 0] + cos * waypoints_m[:, 1]
-        _write_prices(self._prices, local_map.field_m, self._weights)
+        _write_prices(self._prices, local_map.field_m, self._weights, self._robot.radius_m)
         # The way to the second waypoint only where a trajectory can get to the first.
         for leg in range(2 if math.hypot(*waypoints_m[0]) < self._reach_m else 1):
             target = self._waypoints[leg, 0], self._waypoints[leg, 1]
@@ -152,7 +163,8 @@ class TrajectoryCosts:
         Only contact takes velocity away. It is how a robot that has backed into what it cannot see learns of it.
         """
         _, _, _, v_before, omega_before = self._state
-        expected, _ = next_velocities(v_u, omega_u, v_before, omega_before, PERIOD_S)
+        limits = self._robot.acceleration, self._robot.turn_acceleration
+        expected, _ = next_velocities(v_u, omega_u, v_before, omega_before, PERIOD_S, *limits)
         return expected if self._elapsed_s > 0.0 and abs(expected) > abs(v) + _STALLED_M_PER_S else 0.0
 
     def of(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -164,16 +176,25 @@ class TrajectoryCosts:
         costs = np.empty(len(controls))
         layers = self.local_map.field_m, self._ways
         grid = (*self.local_map.corner, self.local_map.settings.cell_m)
-        _costs(costs, controls, self._state, self._waypoints, layers, grid, self._moving, self._weights)
+        known = self._moving, self._weights, self._robot
+        _costs(costs, controls, self._state, self._waypoints, layers, grid, *known)
         return costs
 
 
 # ------------------------------------------------------------------------------------------------ compiled
 # All that the compiled code uses stands in this file: Numba's cache notices no change of another one.
 @njit
-def next_velocities(v_u: float, omega_u: float, v: float, omega: float, period_s: float) -> tuple[float, float]:
+def next_velocities(
+    v_u: float,
+    omega_u: float,
+    v: float,
+    omega: float,
+    period_s: float,
+    acceleration: float = PAPER.max_acceleration_m_per_s2,
+    turn_acceleration: float = PAPER.max_angular_acceleration,
+) -> tuple[float, float]:
     """Return the velocities after a period, as :func:`rcdsac_trl.robot.action.clip_command` has them."""
-    dv, domega = MAX_LINEAR_ACCELERATION * period_s, MAX_ANGULAR_ACCELERATION * period_s
+    dv, domega = acceleration * period_s, turn_acceleration * period_s
     return min(max(v_u, v - dv), v + dv), min(max(omega_u, omega - domega), omega + domega)
 
 
@@ -191,15 +212,15 @@ def _value_at(values: np.ndarray, x0: float, y0: float, cell_m: float, x: float,
 
 
 @njit
-def _write_prices(prices: np.ndarray, field_m: np.ndarray, weights: Any) -> None:
+def _write_prices(prices: np.ndarray, field_m: np.ndarray, weights: Any, radius_m: float) -> None:
     """Write what a metre of way costs, [n, n], from the distances to the nearest point in twice as many cells."""
     for i in range(prices.shape[0]):
         for j in range(prices.shape[1]):
             cells = field_m[_COARSER * i : _COARSER * (i + 1), _COARSER * j : _COARSER * (j + 1)]
-            gap = cells.mean() - ROBOT_RADIUS_M
+            gap = cells.mean() - radius_m
             near = max(0.0, 1.0 - gap / weights.margin_m)
             if gap < 0.0:
-                prices[i, j] = weights.blocked_price * (1.0 - gap / ROBOT_RADIUS_M)
+                prices[i, j] = weights.blocked_price * (1.0 - gap / radius_m)
             else:
                 prices[i, j] = 1.0 + weights.near_price * near * near
 
@@ -214,10 +235,11 @@ def _costs(
     grid: tuple,
     moving: np.ndarray,
     weights: Any,
+    robot: Any,
 ) -> None:
     """Write the cost of each trajectory; every one is computed by itself."""
     for k in range(len(costs)):
-        costs[k] = _cost(controls[k], state, waypoints, layers, grid, moving, weights)
+        costs[k] = _cost(controls[k], state, waypoints, layers, grid, moving, weights, robot)
 
 
 @njit
@@ -229,6 +251,7 @@ def _cost(
     grid: tuple,
     moving: np.ndarray,
     weights: Any,
+    robot: Any,
 ) -> float:
     """Return the cost of one trajectory.
 
@@ -240,6 +263,7 @@ def _cost(
         grid: lower corner of the fields, x and y, and the side of a cell of the local map, m.
         moving: of :class:`MoverTracks`.
         weights: of :class:`CostSettings`.
+        robot: what counts of the robot.
     """
     x, y, yaw, v, omega = state
     field_m, ways = layers
@@ -250,25 +274,25 @@ def _cost(
     last_leg = math.hypot(goal_x - target_x, goal_y - target_y) < _SAME_M
     way = ways[0]
     left_m = _value_at(way, x0, y0, way_cell_m, x, y)
-    gap = _value_at(field_m, x0, y0, cell_m, x, y) - ROBOT_RADIUS_M
+    gap = _value_at(field_m, x0, y0, cell_m, x, y) - robot.radius_m
     cost = 0.0
     steps = len(controls)
     for t in range(steps):
         v_u, omega_u = controls[t, 0], controls[t, 1]
-        if abs(omega_u) < DEAD_BAND:
+        if abs(omega_u) < robot.dead_band:
             omega_u = 0.0
         v_before, omega_before = v, omega
-        v, omega = next_velocities(v_u, omega_u, v, omega, PERIOD_S)
+        v, omega = next_velocities(v_u, omega_u, v, omega, PERIOD_S, robot.acceleration, robot.turn_acceleration)
         turn = 0.5 * (omega_before + omega) * PERIOD_S
         driven_m = 0.5 * (v_before + v) * PERIOD_S
         x_before, y_before, gap_before = x, y, gap
         x += driven_m * math.cos(yaw + 0.5 * turn)
         y += driven_m * math.sin(yaw + 0.5 * turn)
         yaw += turn
-        gap = _value_at(field_m, x0, y0, cell_m, x, y) - ROBOT_RADIUS_M
+        gap = _value_at(field_m, x0, y0, cell_m, x, y) - robot.radius_m
         for disc_x, disc_y, disc_vx, disc_vy, radius, _ in moving:
             away_x, away_y = x - disc_x - disc_vx * (t + 1) * PERIOD_S, y - disc_y - disc_vy * (t + 1) * PERIOD_S
-            gap = min(gap, math.hypot(away_x, away_y) - radius - ROBOT_RADIUS_M)
+            gap = min(gap, math.hypot(away_x, away_y) - radius - robot.radius_m)
         if gap < 0.0 and gap < gap_before:
             # Contact stops the robot, as it does in the world.
             x, y, v, driven_m, gap = x_before, y_before, 0.0, 0.0, gap_before
@@ -281,17 +305,18 @@ def _cost(
         before_m, left_m = left_m, _value_at(way, x0, y0, way_cell_m, x, y)
         gained_m = before_m - left_m
         if gained_m > 0.0:
-            gained_m *= STRAIGHT_FACTOR if omega_u == 0.0 else max(MIN_TURN_FACTOR, 1.0 - abs(omega_u) / TURN_SCALE)
+            turning = max(MIN_TURN_FACTOR, 1.0 - robot.per_turn * abs(omega_u) / TURN_SCALE)
+            gained_m *= STRAIGHT_FACTOR if omega_u == 0.0 else turning
         cost -= gained_m
         straight_m = math.hypot(target_x - x, target_y - y)
         if last_leg and straight_m < weights.goal_radius_m:
             # Whatever the next goal is, the time that is left gains as much as full speed does.
             saved_s = PERIOD_S * (steps - 1 - t)
-            braking_m = 0.5 * v * abs(v) / MAX_LINEAR_ACCELERATION
+            braking_m = 0.5 * v * abs(v) / robot.acceleration
             stop_x, stop_y = x + braking_m * math.cos(yaw), y + braking_m * math.sin(yaw)
-            if _value_at(field_m, x0, y0, cell_m, stop_x, stop_y) < ROBOT_RADIUS_M:
+            if _value_at(field_m, x0, y0, cell_m, stop_x, stop_y) < robot.radius_m:
                 cost += weights.collision_m
-            return cost - weights.goal_m - weights.ahead_m - STRAIGHT_FACTOR * MAX_LINEAR_VELOCITY * saved_s
+            return cost - weights.goal_m - weights.ahead_m - STRAIGHT_FACTOR * robot.speed * saved_s
         if not last_leg and straight_m < weights.waypoint_radius_m:
             target_x, target_y, last_leg = goal_x, goal_y, True
             way = ways[1]

@@ -96,15 +96,41 @@ class MapSettings:
         check_number("clearance_margin_m", self.clearance_margin_m, 0.02, 0.2)
         check_number("waypoint_clearance_m", self.waypoint_clearance_m, 0.0, 2.0)
         check_number("detour_m", self.detour_m, 0.2, 3.0)
-        # Narrower, and the grid might have no row of cells through a passage that is wide enough.
-        passage_m = 2 * (ROBOT_RADIUS_M + self.clearance_margin_m) + CELL_M
+        passage_m = _passage_m(ROBOT_RADIUS_M, self.clearance_margin_m)
         check_range("corridor_width_m", self.corridor_width_m, passage_m, 5.0)
         check_range("door_width_m", self.door_width_m, passage_m, 2.0)
         check_range("mover_radius_m", self.mover_radius_m, 0.05, 0.4)
         check_range("mover_speed_m_per_s", self.mover_speed_m_per_s, 0.05, 2.0)
 
 
-def generate_map(settings: MapSettings, split: Split, seed: int, index: int) -> Map:
+def _passage_m(robot_radius_m: float, margin_m: float) -> float:
+    """Return how wide a passage must be: narrower, and the grid might have no row of cells through it."""
+    return 2 * (robot_radius_m + margin_m) + CELL_M
+
+
+def check_robot_fits(settings: MapSettings, robot_radius_m: float, robot: str) -> None:
+    """Refuse a robot that is too large for the passages of some maps.
+
+    Args:
+        settings: of the maps.
+        robot_radius_m: circumradius of the robot.
+        robot: its name.
+
+    Raises:
+        UserInputError: naming the narrowest passage.
+    """
+    passage_m = _passage_m(robot_radius_m, settings.clearance_margin_m)
+    for name in ("door_width_m", "corridor_width_m"):
+        if (narrowest := getattr(settings, name)[0]) < passage_m:
+            raise UserInputError(
+                f"robot={robot} reaches {robot_radius_m:.3g} m from its centre and needs passages of {passage_m:.3g} "
+                f"m, map.{name} begins at {narrowest:g} m: raise it, or choose a smaller robot"
+            )
+
+
+def generate_map(
+    settings: MapSettings, split: Split, seed: int, index: int, robot_radius_m: float = ROBOT_RADIUS_M
+) -> Map:
     """Generate one map.
 
     The free space for the robot's radius plus ``settings.clearance_margin_m`` is one connected component on
@@ -116,6 +142,7 @@ def generate_map(settings: MapSettings, split: Split, seed: int, index: int) -> 
         split: which family; it is a part of the random stream's purpose, so the families share no map.
         seed: the root seed, at least 0.
         index: the map's number within the family, at least 0.
+        robot_radius_m: circumradius of the robot that is to get about.
 
     Raises:
         UserInputError: the split is unknown, or no connected building was found.
@@ -131,7 +158,7 @@ def generate_map(settings: MapSettings, split: Split, seed: int, index: int) -> 
         raise UserInputError(f"split is {split!r} but must be one of {', '.join(SPLITS)}")
     rng = stream(seed, f"map/{split}", index)
     layout = settings.layouts[rng.integers(len(settings.layouts))]
-    walls, site = _connected_building(settings, layout, rng)
+    walls, site = _connected_building(settings, layout, robot_radius_m, rng)
     crowding = _OPEN_CROWDING if layout == "clutter" else 1.0
     count = round(settings.clutter_per_m2 * crowding * settings.size_m**2)
     num_mapped = round(count * settings.mapped_fraction)
@@ -152,11 +179,13 @@ def generate_map(settings: MapSettings, split: Split, seed: int, index: int) -> 
     )
 
 
-def _connected_building(settings: MapSettings, layout: str, rng: np.random.Generator) -> tuple[list[Box], ClutterSite]:
+def _connected_building(
+    settings: MapSettings, layout: str, robot_radius_m: float, rng: np.random.Generator
+) -> tuple[list[Box], ClutterSite]:
     """Draw buildings until one is connected; a wall too short for its only door is rare."""
     for _ in range(_MAX_BUILDINGS):
         walls = build_walls(layout, settings.size_m, settings.corridor_width_m, settings.door_width_m, rng)
-        clearance_m = ROBOT_RADIUS_M + settings.clearance_margin_m
+        clearance_m = robot_radius_m + settings.clearance_margin_m
         site = ClutterSite(walls, settings.size_m, clearance_m, settings.detour_m)
         if label_components(site.free)[1] == 1:
             return walls, site

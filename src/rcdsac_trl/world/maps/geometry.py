@@ -18,13 +18,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.system.jit import njit
 
 CELL_M = 0.1
 """Side of a grid cell, m."""
 
-ROBOT_RADIUS_M = 0.25
-"""Circumradius of the octagonal robot, m."""
+ROBOT_RADIUS_M = PAPER.circumradius_m
+"""Circumradius of the paper's octagonal robot, m: whoever names no other radius means this one."""
 
 _ROUNDING_M = 1e-9
 _SLACK = 1.03  # a little cost is given for fewer corners, else many lie a step or two apart
@@ -108,6 +109,34 @@ def segment_clearance(
     for i in range(circles.shape[0]):
         distance = _point_segment(circles[i, 0], circles[i, 1], ax, ay, bx, by) - circles[i, 2]
         best = min(best, max(distance, 0.0))
+    return best
+
+
+@njit
+def outline_clearance(
+    corners: NDArray[np.float64],
+    pose: tuple[float, float, float],
+    boxes: NDArray[np.float64],
+    circles: NDArray[np.float64],
+    limit_m: float,
+) -> float:
+    """Return the exact distance from a body's outline to the nearest solid shape, cut off at ``limit_m``.
+
+    Args:
+        corners: of the body, in its own frame, [n, 2], m.
+        pose: its x, y in m and yaw in rad.
+        boxes: see the module.
+        circles: see the module.
+        limit_m: what is farther counts as this far.
+    """
+    x, y, yaw = pose
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    best, n = limit_m, corners.shape[0]
+    for i in range(n):
+        a, b = corners[i], corners[(i + 1) % n]
+        ax, ay = x + cos * a[0] - sin * a[1], y + sin * a[0] + cos * a[1]
+        bx, by = x + cos * b[0] - sin * b[1], y + sin * b[0] + cos * b[1]
+        best = min(best, segment_clearance(ax, ay, bx, by, boxes, circles, best))
     return best
 
 

@@ -5,13 +5,14 @@ from dataclasses import replace
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings, check_file_maps, file_map
 from rcdsac_trl.world.maps.files.map_files import digests, map_files
 from rcdsac_trl.world.maps.generator import MapSettings, Split, generate_map
+from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.maps.shapes import Map
 
 MapSource = MapSettings | FileMapSettings
 """Settings that maps are made from."""
 
 
-def make_map(source: MapSource, split: Split, seed: int, index: int) -> Map:
+def make_map(source: MapSource, split: Split, seed: int, index: int, robot_radius_m: float = ROBOT_RADIUS_M) -> Map:
     """Return a map; equal arguments, and equal files, give equal maps.
 
     Args:
@@ -19,14 +20,15 @@ def make_map(source: MapSource, split: Split, seed: int, index: int) -> Map:
         split: which of the disjoint families.
         seed: the root seed, at least 0.
         index: the map's number within the family, at least 0.
+        robot_radius_m: circumradius of the robot that drives there.
 
     Raises:
         UserInputError: as :func:`~rcdsac_trl.world.maps.generator.generate_map` and
             :func:`~rcdsac_trl.world.maps.files.file_map.file_map`.
     """
     if isinstance(source, FileMapSettings):
-        return file_map(source, split, seed, index)
-    return generate_map(source, split, seed, index)
+        return file_map(source, split, seed, index, robot_radius_m)
+    return generate_map(source, split, seed, index, robot_radius_m)
 
 
 def with_digests(source: MapSource) -> MapSource:
@@ -40,15 +42,16 @@ def with_digests(source: MapSource) -> MapSource:
     return source
 
 
-def check_maps(source: MapSource, min_path_m: float) -> None:
+def check_maps(source: MapSource, min_path_m: float, robot_radius_m: float = ROBOT_RADIUS_M) -> None:
     """Refuse files that maps cannot be made from, before anything is driven; generated maps always serve.
 
     Args:
         source: what maps are made from.
         min_path_m: shortest way from a start to its goal, m.
+        robot_radius_m: circumradius of the robot that drives there.
 
     Raises:
         UserInputError: naming the file, and numbers.
     """
     if isinstance(source, FileMapSettings):
-        check_file_maps(source, min_path_m)
+        check_file_maps(source, min_path_m, robot_radius_m)

@@ -120,8 +120,12 @@ class _Layer:
 class Planner:
     """Starts, goals and paths on one map.
 
-    It depends on the map alone and draws only from the generators it is given, so one planner serves all the
-    agents and movers on its map.
+    It depends on the map and the robot's radius alone and draws only from the generators it is given, so one planner
+    serves all the agents and movers on its map.
+
+    Attributes:
+        map: the map.
+        robot_radius_m: circumradius of the robot.
 
     Example:
         >>> from rcdsac_trl.seeding import stream
@@ -151,7 +155,7 @@ class Planner:
         if not leg_clearance_m(clearance_m) >= robot_radius_m:
             raise UserInputError(f"margin_m={margin_m} is less than a grid of {CELL_M:g} m needs: raise it to 0.02")
         self.map = map
-        self._robot_radius_m = robot_radius_m
+        self.robot_radius_m = robot_radius_m
         self._true = _Layer(map, clearance_m, clearance_m, reachable_only=True)
         self._known = _Layer(map, clearance_m, max(clearance_m, map.waypoint_clearance_m), mapped_only=True)
         widest_m = max((mover.radius for mover in map.movers), default=robot_radius_m)
@@ -210,7 +214,7 @@ class Planner:
         The straight leg must keep the robot's radius from everything known; a robot that is nearer to something
         already must come no nearer.
         """
-        need_m = min(self._robot_radius_m, self._known.clearance(from_xy, from_xy)) - _ROUNDING_M
+        need_m = min(self.robot_radius_m, self._known.clearance(from_xy, from_xy)) - _ROUNDING_M
         return self._known.clearance(from_xy, to_xy) >= need_m
 
     def _lead_past_the_unknown(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:

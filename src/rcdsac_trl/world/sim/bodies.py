@@ -8,8 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.world.maps.generator import Box, Cylinder, Map
-from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.maps.shapes import solid_arrays
 from rcdsac_trl.world.sim.bullet import pybullet
 
@@ -22,11 +22,12 @@ MAX_WHOLE_SHAPES = 512
 # anybody looks again.
 _SQUARE_M = 4.0
 _AROUND_M = 1.0
+# Velocities are set, and nothing else that moves can be pushed: only the ratio of inertia to mass counts.
 _ROBOT_MASS_KG = 10.0
 _ROBOT_HALF_HEIGHT_M = 0.1
 _OBSTACLE_HALF_HEIGHT_M = 0.5
-# That of a uniform cylinder about its axis; about the other two axes nothing can turn the robot.
-_ROBOT_INERTIA = (1e9, 1e9, 0.5 * _ROBOT_MASS_KG * ROBOT_RADIUS_M**2)
+# About the two axes that lie flat nothing can turn the robot.
+_UNTURNABLE = 1e9
 
 
 def invisible_shape(client: int) -> int:
@@ -117,18 +118,12 @@ def _bounds(shapes: list[Box | Cylinder]) -> list[float]:
     return [*low.min(axis=0).tolist(), *high.max(axis=0).tolist()]
 
 
-def add_robot(client: int, start_pose: tuple[float, float, float], visual: int) -> int:
-    """Add the octagonal prism, a flat side faces forward, and return its body's number."""
-    corners = [
-        (ROBOT_RADIUS_M * math.cos(angle), ROBOT_RADIUS_M * math.sin(angle), z)
-        for angle in (math.radians(22.5 + 45.0 * k) for k in range(8))
-        for z in (-_ROBOT_HALF_HEIGHT_M, _ROBOT_HALF_HEIGHT_M)
-    ]
-    shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=corners, physicsClientId=client)
+def add_robot(client: int, start_pose: tuple[float, float, float], visual: int, robot: RobotSettings) -> int:
+    """Add a robot as an upright prism or cylinder, and return its body's number."""
     x, y, yaw = start_pose
-    robot: int = pybullet.createMultiBody(
+    body: int = pybullet.createMultiBody(
         _ROBOT_MASS_KG,
-        shape,
+        _robot_shape(client, robot),
         visual,
         basePosition=(x, y, 0.0),
         baseOrientation=pybullet.getQuaternionFromEuler((0.0, 0.0, yaw)),
@@ -136,16 +131,46 @@ def add_robot(client: int, start_pose: tuple[float, float, float], visual: int) 
     )
     # Friction and restitution of a contact are products of both bodies': 0 here is 0 everywhere.
     pybullet.changeDynamics(
-        robot,
+        body,
         -1,
         linearDamping=0.0,
         angularDamping=0.0,
         lateralFriction=0.0,
         restitution=0.0,
-        localInertiaDiagonal=_ROBOT_INERTIA,
+        localInertiaDiagonal=(_UNTURNABLE, _UNTURNABLE, _inertia(robot)),
         physicsClientId=client,
     )
-    return robot
+    return body
+
+
+def _robot_shape(client: int, robot: RobotSettings) -> int:
+    """Make the collision shape of a robot, around the point that it turns about; return its number."""
+    if robot.shape == "disc":
+        shape: int = pybullet.createCollisionShape(
+            pybullet.GEOM_CYLINDER,
+            radius=robot.radius_m,
+            height=2.0 * _ROBOT_HALF_HEIGHT_M,
+            collisionFramePosition=(robot.middle_x_m, 0.0, 0.0),
+            physicsClientId=client,
+        )
+        return shape
+    corners = [(x, y, z) for x, y in robot.outline.tolist() for z in (-_ROBOT_HALF_HEIGHT_M, _ROBOT_HALF_HEIGHT_M)]
+    shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=corners, physicsClientId=client)
+    return shape
+
+
+def _inertia(robot: RobotSettings) -> float:
+    """Return a robot's moment of inertia about the axis that it turns about, kg m^2.
+
+    Of a round one it is that of a uniform cylinder about its axis, of another one that of a uniform plate.
+    """
+    if robot.is_round:
+        return 0.5 * _ROBOT_MASS_KG * robot.circumradius_m**2
+    start, end = robot.outline, np.roll(robot.outline, -1, axis=0)
+    # The plate as triangles between the axis and each side; twice their areas.
+    areas = start[:, 0] * end[:, 1] - start[:, 1] * end[:, 0]
+    squares = (start * start + start * end + end * end).sum(axis=1)
+    return _ROBOT_MASS_KG * float((areas * squares).sum() / (6.0 * areas.sum()))
 
 
 def add_movers(client: int, discs: NDArray, visual: int) -> list[int]:

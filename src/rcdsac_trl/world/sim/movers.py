@@ -63,6 +63,7 @@ class Movers:
         robot_xy: where the robot starts, m; no mover starts near it.
         rng: stream that tours and starts are drawn from.
         period_s: duration of a step.
+        robot_radius_m: circumradius of the robot.
 
     Attributes:
         discs: float64 [k, 3], x, y and radius of each, m; :meth:`step` moves them in place.
@@ -77,7 +78,9 @@ class Movers:
         robot_xy: tuple[float, float],
         rng: np.random.Generator,
         period_s: float,
+        robot_radius_m: float = ROBOT_RADIUS_M,
     ) -> None:
+        self._robot_radius_m = robot_radius_m
         count = len(map.movers)
         self.discs = np.zeros((count, 3))
         self.discs[:, 2] = [mover.radius for mover in map.movers]
@@ -117,7 +120,7 @@ class Movers:
             movers.
         """
         gap_m: float = walk(
-            self._walks, self.discs, self._tours, robot_x, robot_y, ROBOT_RADIUS_M, self._period_s, periods
+            self._walks, self.discs, self._tours, robot_x, robot_y, self._robot_radius_m, self._period_s, periods
         )
         return gap_m
 
@@ -125,7 +128,8 @@ class Movers:
         """Put a mover somewhere on its tour, away from the robot and from the movers placed before it."""
         tour = self._tours[int(self._walks[number, FIRST]) : int(self._walks[number, LAST])]
         others = np.vstack([np.asarray(robot_xy), self.positions[:number]])
-        reach = self.radii[number] + np.concatenate([[ROBOT_RADIUS_M + START_GAP_M], self.radii[:number] + 0.2])
+        gaps = np.concatenate([[self._robot_radius_m + START_GAP_M], self.radii[:number] + 0.2])
+        reach = self.radii[number] + gaps
         best, best_room = 0.0, -math.inf
         for _ in range(_PLACING_DRAWS):
             along = rng.uniform(0.0, tour[-1, END])

@@ -2,7 +2,7 @@
 
 The world is seen from above: there is no floor and no gravity, walls and clutter are upright and higher than
 the robot, and the robot cannot roll or pitch, so all contact forces are horizontal. The robot is a dynamic
-body that is given its motor controller's velocities every 0.02 s; PyBullet moves it and lets contact take
+body that is given its motor controller's velocities every motor period, 0.02 s; PyBullet moves it and lets contact take
 velocity away, and what is left is what the robot measures.
 """
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
-from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
 from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.generator import Map
-from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M, segment_clearance
+from rcdsac_trl.world.maps.geometry import outline_clearance, segment_clearance
 from rcdsac_trl.world.sim import bodies
 from rcdsac_trl.world.sim.bullet import Client, check_display, pybullet
 from rcdsac_trl.world.sim.lidar import NearSegments, scan
@@ -37,13 +37,14 @@ CONTACT_END_GAP_M = 0.005
 """A contact can only end while nothing is within this gap of the circle around the robot's corners.
 
 Of the circle, not of the body: a robot that turns beside a wall touches it with one corner after the other, between
-which its flat sides are up to 19 mm away. The circle does not turn.
+which its flat sides are up to 19 mm away. The circle does not turn. Of a robot that is not nearly round, such as a
+rectangle, it is the body: its circle is far from its sides.
 """
 CONTACT_END_S = 0.4
 """A contact ends when the gap has been that wide at the end of every agent step for so long."""
 
-# Movers farther than this from touching the robot are moved in PyBullet only once an agent step, in which
-# both together go at most 0.2 m.
+# Movers farther than this from touching the robot, and farther than both can come nearer in an agent step, which is
+# 0.2 m for the paper's robot, are moved in PyBullet only once an agent step.
 _MOVER_SYNC_GAP_M = 0.5
 _UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 # Added to how far the robot and a mover can come nearer to each other, for what rounding and contact add.
@@ -96,6 +97,7 @@ class Simulation:
 
     Args:
         gui: show PyBullet's window and run in real time; PyBullet allows one window a process.
+        robot: which one it is.
 
     Raises:
         UserInputError: the window cannot be opened.
@@ -112,7 +114,8 @@ class Simulation:
         >>> simulation.close()
     """
 
-    def __init__(self, gui: bool = False) -> None:
+    def __init__(self, gui: bool = False, robot: RobotSettings = PAPER) -> None:
+        self.robot = robot
         self._gui = gui
         if gui:
             check_display()
@@ -150,7 +153,7 @@ class Simulation:
         # removeBody this also frees the collision shapes.
         pybullet.resetSimulation(physicsClientId=client)
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=MOTOR_PERIOD_S,
+            fixedTimeStep=self.robot.motor_period_s,
             numSubSteps=1,
             deterministicOverlappingPairs=1,
             physicsClientId=client,
@@ -159,18 +162,20 @@ class Simulation:
         visual = -1 if self._gui else bodies.invisible_shape(client)
         self._static = bodies.StaticBodies(client, map, visual, whole=True if self._gui else None)
         self._static.follow(*start_pose[:2])
-        self._robot = bodies.add_robot(client, start_pose, visual)
+        self._robot = bodies.add_robot(client, start_pose, visual, self.robot)
         x, y, yaw = start_pose
         self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
         self._v_c = self._omega_c = self._clearance_m = 0.0
         self._driven = (0.0, 0.0)
         self._touch = None
         self._in_contact = False
-        movers = self._movers = Movers(map, planner, start_pose[:2], movers_rng, MOTOR_PERIOD_S)
+        movers = self._movers = Movers(
+            map, planner, start_pose[:2], movers_rng, self.robot.motor_period_s, self.robot.circumradius_m
+        )
         self._mover_bodies = list(
             zip(bodies.add_movers(client, movers.discs, visual), movers.radii.tolist(), strict=True)
         )
-        self._segments = NearSegments(map.segments())
+        self._segments = NearSegments(map.segments(), self.robot.lidar.max_range_m)
         self._boxes, static = map.solids()
         # The last rows are the movers' own, so that they are sensed where they walk.
         self._circles = np.concatenate([static, movers.discs])
@@ -204,51 +209,52 @@ class Simulation:
         Args:
             v_u: desired linear velocity, m/s.
             omega_u: desired angular velocity, rad/s.
-            motor_steps: how many steps of 0.02 s, at least 1.
+            motor_steps: how many motor periods, at least 1.
         """
-        client, robot, movers = self._client, self._robot, self._movers
+        client, body, movers, robot = self._client, self._robot, self._movers, self.robot
         x, y, yaw = self._pose
         self._static.follow(x, y)
         v_c, omega_c = self._v_c, self._omega_c
         cos, sin = math.cos(yaw), math.sin(yaw)
         gap_m = movers.step(x, y)
-        self._sync_movers(x, y, everywhere=True)
-        duration_s = motor_steps * MOTOR_PERIOD_S
-        robot_m = max(abs(v_c), MAX_LINEAR_VELOCITY) * duration_s
+        self._sync_movers(x, y)
+        duration_s = motor_steps * robot.motor_period_s
+        robot_m = max(abs(v_c), robot.fastest_m_per_s) * duration_s
         approach_m = robot_m + movers.fastest_m_per_s * duration_s + _SLACK_M
+        sync_gap_m = max(_MOVER_SYNC_GAP_M, approach_m)
         # Movers that cannot notice the robot in this agent step walk through it at once.
-        unnoticed = gap_m > max(movers.notice_gap_m, _MOVER_SYNC_GAP_M) + approach_m and not self._gui
+        unnoticed = gap_m > max(movers.notice_gap_m, sync_gap_m) + approach_m and not self._gui
         if unnoticed:
             movers.step(x, y, motor_steps - 1)
         # Contacts that cannot be are not asked for, nor the velocities that only contact would change.
         self._touch = None
-        touchable = self._clearance_m <= ROBOT_RADIUS_M + CONTACT_DISTANCE_M + approach_m
+        touchable = self._clearance_m <= robot.circumradius_m + CONTACT_DISTANCE_M + approach_m
         self._clearance_m = 0.0  # not known until the next scan
         v, omega = self._driven
         for motor_step in range(motor_steps):
             before = x, y, yaw, v, omega
             if motor_step > 0 and not unnoticed:
                 gap_m = movers.step(x, y)
-                if gap_m < _MOVER_SYNC_GAP_M or self._gui:
-                    self._sync_movers(x, y, everywhere=self._gui)
-            v, omega = clip_command(v_u, omega_u, v_c, omega_c)
+                if gap_m < sync_gap_m or self._gui:
+                    self._sync_movers(x, y, None if self._gui else sync_gap_m)
+            v, omega = clip_command(v_u, omega_u, v_c, omega_c, robot.motor_period_s, robot)
             # By position, which PyBullet reads faster than keywords.
             linear, angular = (v * cos, v * sin, 0.0), (0.0, 0.0, omega)
-            pybullet.resetBaseVelocity(robot, linear, angular, client)
+            pybullet.resetBaseVelocity(body, linear, angular, client)
             pybullet.stepSimulation(client)
-            (x, y, _), turn = pybullet.getBasePositionAndOrientation(robot, client)
+            (x, y, _), turn = pybullet.getBasePositionAndOrientation(body, client)
             if touchable:
-                linear, angular = pybullet.getBaseVelocity(robot, client)
+                linear, angular = pybullet.getBaseVelocity(body, client)
             yaw = 2.0 * math.atan2(turn[2], turn[3])
             cos, sin = math.cos(yaw), math.sin(yaw)
             v_c = linear[0] * cos + linear[1] * sin
             omega_c = angular[2]
             if touchable and self._touch is None:
-                points = pybullet.getContactPoints(bodyA=robot, physicsClientId=client)
+                points = pybullet.getContactPoints(bodyA=body, physicsClientId=client)
                 if any(point[8] <= CONTACT_DISTANCE_M for point in points):
                     self._touch = self._touch_at(points, before, motor_step)
             if self._gui:
-                time.sleep(MOTOR_PERIOD_S)
+                time.sleep(robot.motor_period_s)
         self._pose = (x, y, math.remainder(yaw, 2.0 * math.pi))
         self._v_c, self._omega_c = v_c, omega_c
         self._driven = v, omega
@@ -278,22 +284,29 @@ class Simulation:
         if touched:
             self._in_contact, self._apart_steps = True, 0
         elif self._in_contact:
-            x, y, _ = self._pose
-            wide_m = ROBOT_RADIUS_M + CONTACT_END_GAP_M
-            apart = segment_clearance(x, y, x, y, self._boxes, self._circles, wide_m) >= wide_m
-            self._apart_steps = self._apart_steps + motor_steps if apart else 0
-            self._in_contact = self._apart_steps * MOTOR_PERIOD_S < CONTACT_END_S
+            self._apart_steps = self._apart_steps + motor_steps if self._is_apart() else 0
+            self._in_contact = self._apart_steps * self.robot.motor_period_s < CONTACT_END_S
+
+    def _is_apart(self) -> bool:
+        """Return whether nothing is within the gap in which a contact goes on."""
+        if not self.robot.is_round:
+            gap_m = outline_clearance(self.robot.outline, self._pose, self._boxes, self._circles, CONTACT_END_GAP_M)
+            return bool(gap_m >= CONTACT_END_GAP_M)
+        x, y, _ = self._pose
+        wide_m = self.robot.circumradius_m + CONTACT_END_GAP_M
+        return bool(segment_clearance(x, y, x, y, self._boxes, self._circles, wide_m) >= wide_m)
 
     def scan(self) -> NDArray[np.float64]:
         """Return the exact smallest distance from the robot's centre in each 2-degree sector.
 
         Returns:
-            float64 [180], m; ``inf`` where nothing is within 3 m. See
+            float64 [180], m; ``inf`` where nothing is within the sensor's reach. See
             :func:`rcdsac_trl.world.sim.lidar.sector_distances`.
         """
         distances = np.empty(NUM_BINS)
         x, y, yaw = self._pose
-        self._clearance_m = scan(distances, x, y, yaw, self._segments.near(x, y), self._circles)
+        segments, max_range_m = self._segments.near(x, y), self.robot.lidar.max_range_m
+        self._clearance_m = scan(distances, x, y, yaw, segments, self._circles, max_range_m)
         return distances
 
     def close(self) -> None:
@@ -301,9 +314,9 @@ class Simulation:
         self._connection.close()
         self._client = -1
 
-    def _sync_movers(self, robot_x: float, robot_y: float, everywhere: bool) -> None:
-        """Tell PyBullet where the movers are: all of them, or only those that the robot could touch."""
-        near = ROBOT_RADIUS_M + _MOVER_SYNC_GAP_M
+    def _sync_movers(self, robot_x: float, robot_y: float, gap_m: float | None = None) -> None:
+        """Tell PyBullet where the movers are: all of them, or only those within a gap, m, of the robot."""
+        near = math.inf if gap_m is None else self.robot.circumradius_m + gap_m
         for (body, radius), (x, y, _) in zip(self._mover_bodies, self._movers.discs.tolist(), strict=True):
-            if everywhere or math.hypot(x - robot_x, y - robot_y) < near + radius:
+            if gap_m is None or math.hypot(x - robot_x, y - robot_y) < near + radius:
                 pybullet.resetBasePositionAndOrientation(body, (x, y, 0.0), _UPRIGHT, self._client)

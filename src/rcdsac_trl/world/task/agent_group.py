@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
-from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.generator import SPLITS, MapSettings, Split
 from rcdsac_trl.world.maps.map_source import MapSource, with_digests
 from rcdsac_trl.world.render import Scene
@@ -46,6 +46,7 @@ class AgentGroup(OfOneProcess):
         first_episode: number of each agent's first episode, at least 0.
         gui: show PyBullet's window for the first agent.
         memory_s: for how long an agent is told of points that it saw, s; 0: not at all.
+        robot: which one every agent is.
 
     Attributes:
         buffers: what the agents wrote last, overwritten by every reset and step.
@@ -67,13 +68,14 @@ class AgentGroup(OfOneProcess):
         first_episode: int,
         gui: bool,
         memory_s: float = 0.0,
+        robot: RobotSettings = PAPER,
     ) -> None:
         if split not in SPLITS:
             raise UserInputError(f"split={split!r} does not exist; choose one of {', '.join(SPLITS)}")
         if not agent_ids or not all(isinstance(number, int | np.integer) and number >= 0 for number in agent_ids):
             raise UserInputError(f"agent_ids={list(agent_ids)} must be one or more whole numbers of at least 0")
         self.task = task or TaskSettings()
-        mask = sensor_mask(sensor)
+        mask = robot.sensor_mask(sensor)
         # As the files are now: what is read of them is kept, and another environment may find others.
         maps = with_digests(map_settings or MapSettings())
         self._agents = [
@@ -85,10 +87,12 @@ class AgentGroup(OfOneProcess):
                 agent_id,
                 memory_s=memory_s,
                 gui=gui and row == 0,  # PyBullet opens one window a process
+                robot=robot,
             )
             for row, agent_id in enumerate(agent_ids)
         ]
         self._mask = mask
+        self._max_range_m = robot.lidar.max_range_m
         self._first_episode = _not_negative("first_episode", first_episode)
         self.observations = agent_observations(memory_s)
         self.buffers = Buffers.zeros(len(agent_ids), memory_s)
@@ -176,7 +180,7 @@ class AgentGroup(OfOneProcess):
         buffers, agents = self.buffers, [self._agents[row] for row in rows]
         at = slice(None) if len(rows) == len(self) else rows
         distances = np.array([agent.distances_m for agent in agents])
-        buffers.range[at] = range_observation(distances, self._mask)
+        buffers.range[at] = range_observation(distances, self._mask, self._max_range_m)
         if buffers.remembered is not None:
             buffers.remembered[at] = [agent.remembered for agent in agents]
         numbers = np.array(

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
-from rcdsac_trl.robot.limits import MOTOR_PERIOD_S
 from rcdsac_trl.robot.observation import Point, distance_and_bearing
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.maps.map_source import MapSource, make_map
@@ -37,7 +37,9 @@ _TRAIL_STEPS = 1000
 
 
 @lru_cache(maxsize=_MAPS_KEPT)
-def load_map(source: MapSource, split: Split, seed: int, index: int) -> tuple[Map, Planner]:
+def load_map(
+    source: MapSource, split: Split, seed: int, index: int, robot_radius_m: float = PAPER.circumradius_m
+) -> tuple[Map, Planner]:
     """Return a map and its planner, shared by all agents of this process.
 
     Args:
@@ -45,9 +47,10 @@ def load_map(source: MapSource, split: Split, seed: int, index: int) -> tuple[Ma
         split: which of the disjoint map sets.
         seed: root seed.
         index: which map; episode ``k`` of every agent takes place on map ``k``.
+        robot_radius_m: circumradius of the robot that drives there.
     """
-    map_ = make_map(source, split, seed, index)
-    return map_, Planner(map_)
+    map_ = make_map(source, split, seed, index, robot_radius_m)
+    return map_, Planner(map_, robot_radius_m)
 
 
 def draw_motor_steps(task: TaskSettings, split: Split, seed: int, episode: int, agent_id: int) -> int:
@@ -69,6 +72,7 @@ class NavigationAgent:
         agent_id: the agent's global number, which its random streams derive from.
         memory_s: for how long it remembers points that it saw, s; 0: not at all.
         gui: show PyBullet's window.
+        robot: which one it is.
 
     Attributes:
         pose: x, y in m and yaw in rad, map frame.
@@ -79,7 +83,7 @@ class NavigationAgent:
         reward_components: of the last step, see :func:`~rcdsac_trl.world.task.rules.reward_components`; zeros after
             a reset.
         distances_m: what the range sensor measures, float64 [180], m.
-        remembered: what it remembers, float32 [46], see
+        remembered: what it remembers, float32 [65], see
             :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`; None without a memory.
     """
 
@@ -100,6 +104,7 @@ class NavigationAgent:
         agent_id: int,
         memory_s: float = 0.0,
         gui: bool = False,
+        robot: RobotSettings = PAPER,
     ) -> None:
         self._map_settings = map_settings
         self._task = task
@@ -107,18 +112,21 @@ class NavigationAgent:
         self._split = split
         self._agent_id = agent_id
         self._gui = gui
-        self._memory = RememberedRanges(mask, memory_s) if memory_s > 0.0 else None
+        self._robot = robot
+        self._memory = None
+        if memory_s > 0.0:
+            self._memory = RememberedRanges(mask, memory_s, robot)
         self._simulation: Simulation | None = None
         self._trail: deque[tuple[float, float]] = deque(maxlen=_TRAIL_STEPS)
 
     def reset(self, seed: int, episode: int) -> None:
         """Begin an episode, on the map of the same number."""
         self._seed, self._episode = seed, episode
-        self._map, self._planner = load_map(self._map_settings, self._split, seed, episode)
+        self._map, self._planner = load_map(self._map_settings, self._split, seed, episode, self._robot.circumradius_m)
         self.pose = x, y, _ = self._map.start or self._drawn_start()
         self._motor_steps = draw_motor_steps(self._task, self._split, seed, episode, self._agent_id)
         if self._simulation is None:
-            self._simulation = Simulation(gui=self._gui)
+            self._simulation = Simulation(gui=self._gui, robot=self._robot)
         self._simulation.load(self._map, self._planner, self.pose, self._stream("movers"))
         self._noise = self._stream("noise")
         self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._task.action_delay_steps)
@@ -136,7 +144,7 @@ class NavigationAgent:
     def step(self, action: Sequence[float]) -> None:
         """Take one agent step."""
         simulation, task = self.simulation, self._task
-        v_u, omega_u = desired_velocities(action)
+        v_u, omega_u = desired_velocities(action, self._robot)
         self._delayed.append((v_u, omega_u))
         moved = simulation.step(*self._delayed.popleft(), self._motor_steps)
         collided = rules.collision_due(moved.in_contact, self.in_contact, task.collision_penalty_mode)
@@ -146,7 +154,7 @@ class NavigationAgent:
         _, bearing = distance_and_bearing(self.pose, self._path[self._next])
         self.goal_reached = self._distance_to(self._goal) < task.goal_radius_m
         self.reward_components = rules.reward_components(
-            moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached
+            moved.v_c, bearing, omega_u, moved.in_contact, collided, self.goal_reached, self._robot
         )
         if self.goal_reached:
             self._draw_goal()
@@ -154,7 +162,7 @@ class NavigationAgent:
             self._take_waypoints()
         v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, task.odometry_noise_std, self._noise)
         self.velocities = (v_c, omega_c, v_u, omega_u)
-        self._sense(elapsed_s=self._motor_steps * MOTOR_PERIOD_S)
+        self._sense(elapsed_s=self._motor_steps * self._robot.motor_period_s)
 
     @property
     def next_waypoints(self) -> tuple[Point, Point]:
@@ -180,6 +188,7 @@ class NavigationAgent:
             movers=np.column_stack([simulation.mover_positions, simulation.mover_radii]),
             trail=tuple(self._trail),
             in_contact=self.in_contact,
+            robot=self._robot,
             **self._remembered_places(),
         )
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import inside_dead_band
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
 # Reward (paper, section "Reward").
 BASE_REWARD = -0.02
@@ -24,7 +25,7 @@ STRAIGHT_FACTOR = 1.2
 """r_angular while the desired angular velocity is inside the dead band."""
 MIN_TURN_FACTOR = 0.5
 TURN_SCALE = math.radians(120.0)
-"""The desired angular velocity at which 1 - |omega_u| / scale would reach 0, rad/s."""
+"""The desired angular velocity at which 1 - |omega_u| / scale would reach 0, rad/s, of the paper's robot."""
 
 RULES_VERSION = 2
 """Version of the rules: results of different versions do not compare.
@@ -52,7 +53,8 @@ class TaskSettings:
             what the planner knows, or the waypoint is nearer than :data:`SURE_WAYPOINT_RADIUS_M`.
         goal_radius_m: a goal nearer than this is reached.
         min_path_m: shortest path from where the robot is to a new goal.
-        motor_steps: numbers of 0.02 s motor steps in an agent step; an episode draws one of them.
+        motor_steps: numbers of motor steps, of 0.02 s on the paper's robot, in an agent step; an episode draws one of
+            them.
         range_noise_std_m: standard deviation of the noise on a range.
         range_dropout: probability that a range is lost (reads as "nothing there"), per bin and step.
         odometry_noise_std: standard deviations of the noise on the measured velocities, (m/s, rad/s).
@@ -122,9 +124,18 @@ REWARD_COMPONENTS = ("base", "goal", "waypoint", "angular", "collision")
 
 
 def reward_components(
-    v_c: float, theta_1: float, omega_u: float, in_contact: bool, collided: bool, goal_reached: bool
+    v_c: float,
+    theta_1: float,
+    omega_u: float,
+    in_contact: bool,
+    collided: bool,
+    goal_reached: bool,
+    robot: RobotSettings = PAPER,
 ) -> tuple[float, ...]:
     """Return the parts of the reward in the order of :data:`REWARD_COMPONENTS`.
+
+    What hangs on speeds counts shares of the robot's own: at full speed every robot is paid what the paper's is, and a
+    full turn costs as much.
 
     Args:
         v_c: linear velocity measured after the step, m/s.
@@ -133,14 +144,16 @@ def reward_components(
         in_contact: whether the robot was in contact during the step; r_waypoint is 0 then.
         collided: whether r_coll is due; see :func:`collision_due`.
         goal_reached: whether the goal was reached in this step.
+        robot: whose speeds they are.
 
     Example:
         >>> reward_components(0.5, 0.0, 0.0, False, False, False)
         (-0.02, 0.0, 0.5, 1.2, 0.0)
     """
-    waypoint = 0.0 if in_contact else max(MIN_WAYPOINT_REWARD, max(0.0, v_c) * math.cos(theta_1))
-    turning = max(MIN_TURN_FACTOR, 1.0 - abs(omega_u) / TURN_SCALE)
-    angular = STRAIGHT_FACTOR if inside_dead_band(omega_u) else turning
+    speed = max(0.0, robot.reward_per_speed * v_c)
+    waypoint = 0.0 if in_contact else max(MIN_WAYPOINT_REWARD, speed * math.cos(theta_1))
+    turning = max(MIN_TURN_FACTOR, 1.0 - robot.reward_per_turn * abs(omega_u) / TURN_SCALE)
+    angular = STRAIGHT_FACTOR if inside_dead_band(omega_u, robot) else turning
     goal = GOAL_REWARD if goal_reached else 0.0
     collision = COLLISION_REWARD if collided else 0.0
     return BASE_REWARD, goal, waypoint, angular, collision

@@ -5,9 +5,10 @@ from typing import Literal
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import SENSORS, check_memory
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.checks import positive
 from rcdsac_trl.system.processes import resolve_num_workers
-from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.maps.generator import MapSettings, check_robot_fits
 from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.task.rules import TaskSettings
 
@@ -28,9 +29,11 @@ class WorldSettings:
             is not above the number of cores this process may use.
         worker_timeout_s: seconds without an answer after which a worker process counts as hung; None: it never does.
         gui: show PyBullet's window for the first agent.
+        robot: which one it is; its sensor limits what `sensor` names.
 
     Raises:
-        UserInputError: for an unknown sensor, and agents that the workers cannot share evenly.
+        UserInputError: for an unknown sensor, one that this robot sees nothing of, a robot that does not fit through
+            the maps' passages, and agents that the workers cannot share evenly.
 
     Example:
         >>> WorldSettings(sensor="sparse").num_agents
@@ -45,12 +48,16 @@ class WorldSettings:
     num_workers: int | Literal["auto"] = "auto"
     worker_timeout_s: float | None = None
     gui: bool = False
+    robot: RobotSettings = PAPER
 
     def __post_init__(self) -> None:
-        """Refuse an unknown sensor and agents that the workers cannot share."""
+        """Refuse an unknown sensor, a robot that cannot drive here, and agents that the workers cannot share."""
         if self.sensor not in SENSORS:
             raise UserInputError(f"sensor.name={self.sensor} is unknown: choose one of {', '.join(sorted(SENSORS))}")
         check_memory(self.memory_s)
+        self.robot.sensor_mask(self.sensor)
+        if isinstance(self.map_settings, MapSettings):
+            check_robot_fits(self.map_settings, self.robot.circumradius_m, self.robot.name)
         if self.num_agents < 1:
             raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
         resolve_num_workers(self.num_workers, self.num_agents)

@@ -101,13 +101,14 @@ class FileMapSettings:
         check_number("map.detour_m", self.detour_m, 0.2, 3.0)
         check_number("map.connected_share", self.connected_share, 0.0, 1.0)
 
-    @property
-    def clearance_m(self) -> float:
-        """What a place must be clear of everything to be free, m."""
-        return ROBOT_RADIUS_M + self.clearance_margin_m
+    def clearance_m(self, robot_radius_m: float) -> float:
+        """Return what a place must be clear of everything to be free for a robot, m."""
+        return robot_radius_m + self.clearance_margin_m
 
 
-def file_map(settings: FileMapSettings, split: str, seed: int, index: int) -> Map:
+def file_map(
+    settings: FileMapSettings, split: str, seed: int, index: int, robot_radius_m: float = ROBOT_RADIUS_M
+) -> Map:
     """Return the map of an index: a file's building, with the clutter and the movers of that index.
 
     Args:
@@ -115,14 +116,15 @@ def file_map(settings: FileMapSettings, split: str, seed: int, index: int) -> Ma
         split: a part of the random stream's purpose.
         seed: the root seed, at least 0.
         index: the map's number within the split, at least 0.
+        robot_radius_m: circumradius of the robot that drives there.
 
     Raises:
         UserInputError: a file cannot be read, has changed, or cannot serve this robot.
     """
     files = map_files(settings.path)
-    building, floor = read_building(settings, files[index % len(files)])
+    building, floor = read_building(settings, files[index % len(files)], robot_radius_m)
     rng = stream(seed, f"file map/{split}", index)
-    pieces = _clutter(settings, building, floor, rng)
+    pieces = _clutter(settings, building, floor, robot_radius_m, rng)
     movers = [
         Mover(float(rng.uniform(*settings.mover_radius_m)), float(rng.uniform(*settings.mover_speed_m_per_s)))
         for _ in range(settings.num_movers)
@@ -136,7 +138,7 @@ def file_map(settings: FileMapSettings, split: str, seed: int, index: int) -> Ma
 
 
 def _clutter(
-    settings: FileMapSettings, building: Map, floor: FreeFloor, rng: np.random.Generator
+    settings: FileMapSettings, building: Map, floor: FreeFloor, robot_radius_m: float, rng: np.random.Generator
 ) -> list[Box | Cylinder]:
     count = round(settings.unmapped_clutter_per_m2 * floor.area_m2)
     if not count:
@@ -144,7 +146,7 @@ def _clutter(
     site = ClutterSite(
         list(building.boxes),
         building.size_m,
-        settings.clearance_m,
+        settings.clearance_m(robot_radius_m),
         settings.detour_m,
         standing=building.cylinders,
         floor=floor.connected,
@@ -155,12 +157,15 @@ def _clutter(
 
 
 @lru_cache(maxsize=_PLANS_KEPT)
-def read_building(settings: FileMapSettings, file: Path) -> tuple[Map, FreeFloor]:
+def read_building(
+    settings: FileMapSettings, file: Path, robot_radius_m: float = ROBOT_RADIUS_M
+) -> tuple[Map, FreeFloor]:
     """Read a file as a map without anything added, and see where the robot fits.
 
     Args:
         settings: how it is read.
         file: one of :func:`~rcdsac_trl.world.maps.files.map_files.map_files`.
+        robot_radius_m: circumradius of the robot that drives there.
 
     Raises:
         UserInputError: as :func:`file_map`.
@@ -183,8 +188,9 @@ def read_building(settings: FileMapSettings, file: Path) -> tuple[Map, FreeFloor
         start=start,
         goal=goal,
     )
-    floor = free_floor(building, settings.clearance_m)
-    _check_floor(settings, file, building, floor)
+    clearance_m = settings.clearance_m(robot_radius_m)
+    floor = free_floor(building, clearance_m)
+    _check_floor(settings, file, building, floor, clearance_m)
     return building, floor
 
 
@@ -202,7 +208,7 @@ def _plan(settings: FileMapSettings, file: Path) -> FloorPlan:
             return read_map_json(file, mapped=settings.mapped)
 
 
-def _check_floor(settings: FileMapSettings, file: Path, building: Map, floor: FreeFloor) -> None:
+def _check_floor(settings: FileMapSettings, file: Path, building: Map, floor: FreeFloor, need_m: float) -> None:
     """Refuse islands, a map that is open at its edge, and a start or goal where the robot does not fit."""
     if floor.share < settings.connected_share:
         raise UserInputError(
@@ -219,14 +225,19 @@ def _check_floor(settings: FileMapSettings, file: Path, building: Map, floor: Fr
         )
     for name in ("start", "goal"):
         if (place := getattr(building, name)) is not None:
-            _check_place(settings, file, name, place, building, floor)
+            _check_place(settings, file, name, place, building, floor, need_m)
 
 
 def _check_place(
-    settings: FileMapSettings, file: Path, name: str, place: Sequence[float], building: Map, floor: FreeFloor
+    settings: FileMapSettings,
+    file: Path,
+    name: str,
+    place: Sequence[float],
+    building: Map,
+    floor: FreeFloor,
+    need_m: float,
 ) -> None:
     x, y = place[:2]
-    need_m = settings.clearance_m
     row, column = int(y / CELL_M), int(x / CELL_M)
     side = len(floor.connected)
     given = list(getattr(settings, name) or place)
@@ -245,12 +256,13 @@ def _check_place(
         )
 
 
-def check_file_maps(settings: FileMapSettings, min_path_m: float) -> None:
+def check_file_maps(settings: FileMapSettings, min_path_m: float, robot_radius_m: float = ROBOT_RADIUS_M) -> None:
     """Read all files and refuse those in which starts and goals cannot be drawn.
 
     Args:
         settings: which files.
         min_path_m: shortest way from a start to its goal, m.
+        robot_radius_m: circumradius of the robot that drives there.
 
     Raises:
         UserInputError: as :func:`file_map`, or a floor is too small.
@@ -258,7 +270,7 @@ def check_file_maps(settings: FileMapSettings, min_path_m: float) -> None:
     files = map_files(settings.path)
     check_digests(settings.sha256, files, all_of_them=True)
     for file in files:
-        building, floor = read_building(settings, file)
+        building, floor = read_building(settings, file, robot_radius_m)
         if building.start is not None and building.goal is not None:
             continue
         # The ends of the longest way: from any place one of them is at least half of it away.
