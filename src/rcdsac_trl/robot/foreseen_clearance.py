@@ -2,9 +2,9 @@
 
 A few centimetres beside the way decide whether a corner is clipped, and networks read them badly off ranges in sectors.
 A planner computes them (Fox, Burgard and Thrun 1997), and an agent may as well be told (DWA-RL, Patel et al. 2021, does
-so): for a fan of commands, the smallest distance within two horizons, by the robot's own motion model. The near one tells
-what is about to be touched: a robot stops within 0.4 s. The far one tells which way to pass where there is room; in narrow
-places no command can be held so long.
+so): for a fan of commands, the smallest distance within two horizons, by the robot's own motion model. The near one
+tells what is about to be touched: a robot stops within 0.4 s. The far one tells which way to pass where there is room;
+in narrow places no command can be held so long.
 """
 
 import math
