@@ -83,14 +83,14 @@ def test_every_run_of_every_experiment_is_accepted(experiment: str, monkeypatch:
 
 
 def test_the_command_line_narrows_an_experiment() -> None:
-    made = jobs("experiment=study", "experiment.only=[baseline,batch-128]", "+algo=sac", "seed=3", "map=easy")
-    assert list(made) == ["baseline-sac-narrow-s3", "batch-128-sac-narrow-s3"]
-    assert made["batch-128-sac-narrow-s3"].run == "batch-128"
-    assert made["batch-128-sac-narrow-s3"].overrides == (
+    made = jobs("experiment=study", "experiment.only=[baseline,batch-64]", "+algo=sac", "seed=3", "map=easy")
+    assert list(made) == ["baseline-sac-narrow-s3", "batch-64-sac-narrow-s3"]
+    assert made["batch-64-sac-narrow-s3"].run == "batch-64"
+    assert made["batch-64-sac-narrow-s3"].overrides == (
         "preset=laptop",
         "+algo=sac",
         "seed=3",
-        "learner.batch_size=128",
+        "learner.batch_size=64",
         "map=easy",
     )
 

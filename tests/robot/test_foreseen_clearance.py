@@ -1,9 +1,11 @@
 """How near commands would lead, against ways computed by hand."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rcdsac_trl.robot.foreseen_clearance import MIRRORED_COMMANDS, ForeseenClearance
 from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
@@ -12,7 +14,14 @@ from rcdsac_trl.robot.observation import NUM_FORESEEN_COMMANDS
 NOBODY = np.empty((0, 6))
 ORIGIN = np.zeros(3)
 COMMANDS = ForeseenClearance().commands
-foreseen_nearness = ForeseenClearance().nearness
+SOON, LATER = slice(0, 19), slice(19, 38)
+
+
+def foreseen_nearness(*given: Any) -> NDArray[np.float32]:
+    """Return what is told of the far horizon."""
+    return ForeseenClearance().nearness(*given)[LATER]
+
+
 AHEAD, HALF_AHEAD, BACK = 4, 12, 17
 
 
@@ -78,3 +87,13 @@ def test_nothing_near_is_nothing() -> None:
     far = np.array([[2.5, 0.0]])
     assert not foreseen_nearness(far, NOBODY, ORIGIN, 0.6, 0.0).any()
     assert not foreseen_nearness(np.empty((0, 3)), NOBODY, ORIGIN, 0.6, 0.0).any()
+
+
+def test_the_near_horizon_ends_after_three_steps() -> None:
+    """At full speed it sees what the robot passes on 0.252 m."""
+    told = ForeseenClearance().nearness(np.array([[0.252, 0.3]]), NOBODY, ORIGIN, 0.6, 0.0)
+    assert told[SOON][AHEAD] == told[LATER][AHEAD] == pytest.approx(nearness(0.3), abs=1e-5)
+    told = ForeseenClearance().nearness(np.array([[0.252 + 0.4, 0.3]]), NOBODY, ORIGIN, 0.6, 0.0)
+    assert told[SOON][AHEAD] == pytest.approx(nearness(0.5), abs=1e-5)
+    assert told[LATER][AHEAD] > nearness(0.31)
+    assert (told[SOON] <= told[LATER]).all()

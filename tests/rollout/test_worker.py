@@ -137,7 +137,7 @@ def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pyt
 
 def test_episodes_that_end_early_are_the_beginning_of_whole_ones() -> None:
     settings = tiny_settings("sac")
-    worker = evaluation_worker(settings.training_world, None, [Condition()], "validation", 0, 2, memory=4)
+    worker = evaluation_worker(settings.training_world, None, [Condition()], "validation", 0, 2, state_size=4)
     calls = iter(range(100))
     drive = partial(worker.rollout, PursuitPolicy(), 1, observed=("pose",), happened=("contact",))
     whole, short = drive(), drive(ended=lambda written: "contact" in written and next(calls) == 6)

@@ -754,15 +754,15 @@ Spied = list[tuple[str, int, int, Map]]
 def spied_maps(monkeypatch: pytest.MonkeyPatch) -> Iterator[Spied]:
     """Every map that is generated: split, seed, index and the map itself."""
     seen: Spied = []
-    original: Callable[..., Map] = episode.generate_map
+    original: Callable[..., Map] = episode.make_map
 
-    def spy(settings: Any, split: str, seed: int, index: int) -> Map:
-        map_ = original(settings, split, seed, index)
+    def spy(source: Any, split: str, seed: int, index: int, robot_radius_m: float) -> Map:
+        map_ = original(source, split, seed, index, robot_radius_m)
         seen.append((split, seed, index, map_))
         return map_
 
     episode.load_map.cache_clear()
-    monkeypatch.setattr(episode, "generate_map", spy)
+    monkeypatch.setattr(episode, "make_map", spy)
     yield seen
     episode.load_map.cache_clear()
 

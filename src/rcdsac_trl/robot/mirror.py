@@ -18,15 +18,18 @@ from rcdsac_trl.robot.range_sensor import NUM_BINS
 
 _SECTORS = np.arange(NUM_REMEMBERED_SECTORS)
 _MOVERS = np.arange(REMEMBERED_MOVER_SIZE * NUM_REMEMBERED_MOVERS) + NUM_REMEMBERED_SECTORS
+_SOON, _LATER = REMEMBERED_SIZE - 2 * NUM_FORESEEN_COMMANDS, REMEMBERED_SIZE - NUM_FORESEEN_COMMANDS
 
 MIRRORED: dict[str, tuple[NDArray[np.intp], NDArray[np.float32]]] = {
     # The sine of a bearing, an angular velocity, and a velocity to the left change their sign.
     "waypoint": (np.arange(6), np.array([1, 1, -1] * 2, np.float32)),
     "velocity": (np.arange(4), np.array([1, -1] * 2, np.float32)),
     "remembered": (
-        np.concatenate([_SECTORS[::-1], _MOVERS, REMEMBERED_SIZE - NUM_FORESEEN_COMMANDS + MIRRORED_COMMANDS]),
+        np.concatenate([_SECTORS[::-1], _MOVERS, _SOON + MIRRORED_COMMANDS, _LATER + MIRRORED_COMMANDS]),
         np.array(
-            [1] * NUM_REMEMBERED_SECTORS + [1, 1, -1, 1, -1] * NUM_REMEMBERED_MOVERS + [1] * NUM_FORESEEN_COMMANDS,
+            [1] * NUM_REMEMBERED_SECTORS
+            + [1, 1, -1, 1, -1] * NUM_REMEMBERED_MOVERS
+            + [1] * (2 * NUM_FORESEEN_COMMANDS),
             np.float32,
         ),
     ),

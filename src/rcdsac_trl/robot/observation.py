@@ -53,10 +53,10 @@ REMEMBERED_MOVER_SIZE = 5
 
 
 NUM_FORESEEN_COMMANDS = 19
-"""Commands whose clearance is foreseen; see :mod:`rcdsac_trl.robot.foreseen_clearance`."""
+"""Commands whose clearance is foreseen, for two horizons; see :mod:`rcdsac_trl.robot.foreseen_clearance`."""
 
 
-REMEMBERED_SIZE = NUM_REMEMBERED_SECTORS + NUM_REMEMBERED_MOVERS * REMEMBERED_MOVER_SIZE + NUM_FORESEEN_COMMANDS
+REMEMBERED_SIZE = NUM_REMEMBERED_SECTORS + NUM_REMEMBERED_MOVERS * REMEMBERED_MOVER_SIZE + 2 * NUM_FORESEEN_COMMANDS
 """Numbers that tell what is remembered; see :class:`rcdsac_trl.robot.remembered_ranges.RememberedRanges`."""
 
 Point = tuple[float, float]
@@ -71,7 +71,7 @@ def vector_observations(memory_s: float) -> dict[str, int]:
 
     Example:
         >>> vector_observations(0.0), vector_observations(12.0)["remembered"]
-        ({'waypoint': 6, 'velocity': 4}, 65)
+        ({'waypoint': 6, 'velocity': 4}, 84)
     """
     return VECTOR_OBSERVATIONS | ({"remembered": REMEMBERED_SIZE} if memory_s > 0.0 else {})
 

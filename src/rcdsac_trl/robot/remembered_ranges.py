@@ -56,7 +56,7 @@ class RememberedRanges:
         >>> ranges_m[0] = 0.48
         >>> told = remembered.observe(ranges_m, v=0.0, omega=0.0, elapsed_s=0.0)
         >>> told.shape, round(float(told[0]), 6)
-        ((65,), 1.0)
+        ((84,), 1.0)
     """
 
     def __init__(self, sensed: NDArray[np.bool_], memory_s: float, robot: RobotSettings = PAPER) -> None:
@@ -121,12 +121,12 @@ class RememberedRanges:
                 read either, so what is remembered there stays.
 
         Returns:
-            float32 [65]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
+            float32 [84]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
             degrees, counter-clockwise from straight ahead: log10((R - r) / (distance - r)) with the sensor's reach R,
             3 m, and the inner radius r, 0.2 m; 0 where nothing is known within R.
             Then, for each of the two nearest things that move: its nearness, that times the cosine and the sine of its
             bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
-            Last, for each of 19 commands, how near it would lead to all that; see
+            Last, for each of 19 commands, how near it would lead to all that soon, and then later; see
             :class:`~rcdsac_trl.robot.foreseen_clearance.ForeseenClearance`.
         """
         self._reckoning.move(v, omega, elapsed_s)
@@ -145,7 +145,7 @@ class RememberedRanges:
         self._moving = moving
         _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose, self._reach_m)
         _tell_movers(told, moving, pose, self._reach_m)
-        told[-NUM_FORESEEN_COMMANDS:] = self._foreseen.nearness(points[: self._number], moving, pose, v, omega)
+        told[-2 * NUM_FORESEEN_COMMANDS :] = self._foreseen.nearness(points[: self._number], moving, pose, v, omega)
         return told
 
 

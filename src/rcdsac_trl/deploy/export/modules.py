@@ -52,7 +52,7 @@ class ActorStep(nn.Module):
             velocity: [B, 4].
             context: ``beta`` or the collision weight, [B, 1]; not read by an agent that is told neither.
             memory: the state, [B, state]; zeros at the start.
-            remembered: [B, 65], of an agent that is told what it saw.
+            remembered: [B, 84], of an agent that is told what it saw.
         """
         vectors = (waypoint, velocity, remembered, context if self.weighted else None)
         read, after = _encode(self.encoder, range_, vectors, memory)
