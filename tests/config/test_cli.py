@@ -126,7 +126,6 @@ def refusal(
         ([POW, "checkpoint.every_iterations=-5"], "checkpoint.every_iterations=-5 must be at least 1"),
         ([POW, "network.memory=0"], "memory = 0 is below 1"),
         ([POW, "network.restart_steps=0"], "network.restart_steps=0 is below 1: give a number of steps or null"),
-        ([POW, "network.restart_steps=5"], "look back 10 observations, and learner.sequence_length=8 unrolls 9"),
         ([POW, "map.size_m=big"], "map.size_m=big must be a number"),
         ([POW, "map.num_movers=-1"], "num_movers is -1 but must be"),
         ([POW, "map.layouts=rooms"], "map.layouts=rooms must be a list of words in brackets"),

@@ -153,12 +153,6 @@ class TrainingSettings:
                 f"learner.sequence_length={sequence_length} is longer than an episode of "
                 f"task.episode_steps={episode_steps} transitions: shorten it"
             )
-        restart_steps, unrolled = self.network.restart_steps, sequence_length + 1
-        if restart_steps is not None and 2 * restart_steps > unrolled:
-            raise UserInputError(
-                f"network.restart_steps={restart_steps} lets agents look back {2 * restart_steps} observations, and "
-                f"learner.sequence_length={sequence_length} unrolls {unrolled}: give at most {unrolled // 2}, or null"
-            )
         iteration_steps = self.training_world.num_agents * episode_steps
         if self.replay.capacity_steps < iteration_steps:
             raise UserInputError(
