@@ -10,6 +10,7 @@ from rcdsac_trl.system.checks import positive
 from rcdsac_trl.system.processes import resolve_num_workers
 from rcdsac_trl.world.maps.generator import MapSettings, check_robot_fits
 from rcdsac_trl.world.maps.map_source import MapSource
+from rcdsac_trl.world.maps.planner import check_margin
 from rcdsac_trl.world.task.rules import TaskSettings
 
 
@@ -58,6 +59,7 @@ class WorldSettings:
         self.robot.sensor_mask(self.sensor)
         if isinstance(self.map_settings, MapSettings):
             check_robot_fits(self.map_settings, self.robot.circumradius_m, self.robot.name)
+        check_margin(self.map_settings.clearance_margin_m, self.robot.circumradius_m)
         if self.num_agents < 1:
             raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
         resolve_num_workers(self.num_workers, self.num_agents)
