@@ -1,6 +1,7 @@
 """Runs through BARN's worlds as tables, a world and a condition, beside what others have published."""
 
 import json
+import math
 from pathlib import Path
 
 import pandas as pd
@@ -82,7 +83,8 @@ def _line(name: str, found: dict[str, Interval]) -> str:
     shown = f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]"
     timeout, time_s = 100 * found["timeout"].value, found["time_s"].value
     rates = f"{success:>22}{collision:>22}{timeout:>8.1f} %"
-    return f"{name:30}{rates}{time_s:>7.1f} s{shown:>23}{found['later_score'].value:>7.3f}"
+    time = "-" if math.isnan(time_s) else f"{time_s:.1f} s"
+    return f"{name:30}{rates}{time:>9}{shown:>23}{found['later_score'].value:>7.3f}"
 
 
 def _percent(interval: Interval) -> str:
