@@ -404,6 +404,22 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda path: write_world(path.with_name("a.world"), [(0, 0, 0.1)], roll=1.57),
         "only an upright cylinder",
     ),
+    "world with an include": (
+        text("a.world", "<sdf><world><include><uri>model://table</uri></include></world></sdf>"),
+        "includes 'model://table', which is not read",
+    ),
+    "world with a model in a model": (
+        text("a.world", "<sdf><world><model name='set'><model name='post'/></model></world></sdf>"),
+        "the model set holds another one, which is not read",
+    ),
+    "world with a pose elsewhere": (
+        text("a.world", "<sdf><world><model name='a'><pose relative_to='b'>1 2 0 0 0 0</pose></model></world></sdf>"),
+        "a pose is relative to 'b', which is not read",
+    ),
+    "world of no size": (
+        lambda path: write_world(path.with_name("a.world"), [(0, 0, 0.0)]),
+        "the radius of cylinder_0 is 0, and must be above 0",
+    ),
     "json": (text("a.json", "{"), "is no map: Expecting"),
     "json without a size": (text("a.json", '{"walls": []}'), "is no map: 'size_m' is missing"),
     "json with a strange key": (
