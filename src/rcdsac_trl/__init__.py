@@ -23,7 +23,7 @@ each other: they meet in these keys, each with the shape of one agent's entry.
 | `truncated`, `done` | 1 bool | true after the last step | StepCounter | collector |
 | `step_count` | 1 i64 | agent steps | StepCounter | StepCounter |
 | `is_init` | 1 bool | true at the first step | InitTracker | actor |
-| `recurrent_state` | 128 f32 | zero at reset, not in the replay | actor | actor |
+| `recurrent_state` | 128 f32 | zero at reset, not in the replay; 257 with `network.restart_steps` | actor | actor |
 """
 
 import sys

@@ -99,9 +99,11 @@ def test_a_robotlaser_says_its_own_angles_reach_and_velocities(tmp_path: Path) -
     ("line", "told"),
     [
         ("FLASER 3 1.0 2.0", r"line 2 of .* is no FLASER of CARMEN \(it says 3 readings"),
+        ("FLASER 1 1.0 0 0 0 0 0 0 5.0 host 0", r"line 2 of .* \(1 readings make no half turn"),
         ("FLASER some 1.0", r"line 2 of .* is no FLASER of CARMEN \(invalid literal"),
         ("ODOM 1.0 2.0 0.5", r"line 2 of .* is no ODOM of CARMEN"),
         ("PARAM robot_front_laser_max far", "line 2 of .*: robot_front_laser_max far cannot be"),
+        ("PARAM robot_front_laser_max 0", "line 2 of .*: robot_front_laser_max 0 cannot be .*above 0 m"),
         ("PARAM robot_frontlaser_offset 150", "line 2 of .*: robot_frontlaser_offset 150 cannot be .*give metres"),
     ],
 )

@@ -173,6 +173,9 @@ def test_the_guard_is_the_robots() -> None:
     assert full(PAPER).guard == Guard() == Guard.of(PAPER)
     assert Policy(agent(), guard=None).guard is None
     assert Policy(agent(robot=CAR), guard=Guard.of(CAR, margin_m=0.1)).guard.margin_m == 0.1  # type: ignore[union-attr]
+    for made in (lambda: Guard.of("jackal"), lambda: Guard(robot="jackal")):  # type: ignore[arg-type]
+        with pytest.raises(UserInputError, match=r"robot='jackal' of the guard is none: give policy\.robot"):
+            made()
     with pytest.raises(UserInputError, match="guard='off' is none: give"):
         Policy(agent(), guard="off")  # type: ignore[arg-type]
     with pytest.raises(UserInputError, match=r"limits of robot=paper, and this agent drives robot=car: give Guard\.of"):

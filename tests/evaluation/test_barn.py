@@ -20,6 +20,7 @@ from rcdsac_trl.evaluation.barn_runs import run_metrics
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.report.barn_report import describe_evaluation, write_barn
 from rcdsac_trl.rollout.collisions import COLLISIONS
+from rcdsac_trl.world.maps.files.barn import optimal_time_s
 
 SIDES = [(x, y, 0.075) for x in (-4.5, 0.0) for y in np.arange(0.0, 9.6, 0.5).tolist()]
 # A way of 10 m straight ahead: two cells in the middle column of a world.
@@ -149,6 +150,19 @@ def test_a_missing_path_is_told_before_anything_is_driven(worlds: Path, tmp_path
     (worlds / "path_12.npy").unlink()
     given = ["baseline=pursuit", "map=barn", f"map.path={worlds}", f"out={tmp_path / 'out'}"]
     with pytest.raises(UserInputError, match=r"path_12\.npy is missing, and BARN's score needs it"):
+        make_evaluation(compose("evaluate", given))
+
+
+@pytest.mark.parametrize("cells", [np.zeros((3, 3)), np.zeros(2), np.full((3, 2), np.nan)])
+def test_a_path_of_another_shape_is_told(cells: np.ndarray, tmp_path: Path) -> None:
+    np.save(tmp_path / "path_12.npy", cells)
+    with pytest.raises(UserInputError, match=r"path_12\.npy beside .* cannot be read \(its shape is"):
+        optimal_time_s(tmp_path / "world_12.world")
+
+
+def test_a_film_of_a_world_that_is_not_there_is_refused(worlds: Path, tmp_path: Path) -> None:
+    given = ["baseline=pursuit", "map=barn", f"map.path={worlds}", f"out={tmp_path}", "record=true", "video.map=2"]
+    with pytest.raises(UserInputError, match=r"video\.map=2 is not among the 2 worlds that are there"):
         make_evaluation(compose("evaluate", given))
 
 

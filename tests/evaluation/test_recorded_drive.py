@@ -184,6 +184,14 @@ def test_what_cannot_be_replayed_is_told_before_work_starts(
     assert not out.exists()
 
 
+def test_a_wrong_stamp_is_told_before_it_makes_millions_of_periods(tmp_path: Path) -> None:
+    stamps_s = (0.0, 0.2, 3.0e6, 3.0e6 + 0.2)
+    path = tmp_path / "jump.log"
+    path.write_text("".join(f"FLASER 2 1 1 0 0 0 {at} 0 0 {stamp} host 0\n" for at, stamp in enumerate(stamps_s)))
+    with pytest.raises(UserInputError, match=r"says nothing for 3000000 s, from 0\.2 s on, .* is a stamp wrong there"):
+        make_replay(compose("replay", [f"recording={path}"]))
+
+
 def test_a_robot_that_stood_has_no_way(tmp_path: Path) -> None:
     path = tmp_path / "still.log"
     path.write_text("".join(f"FLASER 2 1 1 0 0 0 0 0 0 {at}.0 host 0\n" for at in range(5)))
@@ -239,6 +247,7 @@ def test_the_command_writes_tables_and_a_page(
     assert "http" not in html.replace("http-equiv", "")
     described = json.loads((folder / "there" / "replay.json").read_text())
     assert (described["recording"], described["waypoints"], described["beta"]) == ("a drive.log", "trajectory", -1.0)
+    assert described["max_range_m"] == 3.0
 
 
 def test_a_film_is_written_where_it_is_asked_for(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -189,6 +189,11 @@ def test_the_same_agent_twice_is_refused_but_another_training_seed_is_not(tmp_pa
 def test_what_is_no_evaluation_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="name what to report on"):
         read_episodes([])
+    barn = tmp_path / "barn"
+    barn.mkdir()
+    (barn / "barn.json").write_text("{}")
+    with pytest.raises(UserInputError, match=r"barn holds runs through BARN's worlds, which its summary\.csv sums up"):
+        read_episodes([barn])
     with pytest.raises(UserInputError, match=r"holds no evaluation\.json"):
         read_episodes([tmp_path])
     folder = evaluate(tmp_path / "a", "sac", {NONE: 0})

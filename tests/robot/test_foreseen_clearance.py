@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rcdsac_trl.robot.foreseen_clearance import MIRRORED_COMMANDS, ForeseenClearance
 from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
 from rcdsac_trl.robot.observation import NUM_FORESEEN_COMMANDS
+from rcdsac_trl.robot.robot_settings import RobotSettings
 
 NOBODY = np.empty((0, 6))
 ORIGIN = np.zeros(3)
@@ -97,3 +98,16 @@ def test_the_near_horizon_ends_after_three_steps() -> None:
     assert told[SOON][AHEAD] == pytest.approx(nearness(0.5), abs=1e-5)
     assert told[LATER][AHEAD] > nearness(0.31)
     assert (told[SOON] <= told[LATER]).all()
+
+
+def test_another_robot_foresees_by_its_own_limits_and_size() -> None:
+    """2.5 m/s2 over 0.14 s: 0.35, 0.7, .., 1.75, 2, .. m/s, so it goes (2.5 * 2.5 + 1.875 + 4 * 2) * 0.14 m."""
+    cart = RobotSettings(
+        "cart", "disc", 0.3, None, max_speed_m_per_s=2.0, max_reverse_m_per_s=0.0, max_acceleration_m_per_s2=2.5
+    )
+    clearance = ForeseenClearance(cart)
+    assert clearance.commands[[AHEAD, HALF_AHEAD, BACK]].tolist() == [[2.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    went_m = (0.175 + 0.525 + 0.875 + 1.225 + 1.575 + 1.875 + 4 * 2.0) * 0.14
+    told = clearance.nearness(np.array([[went_m + 0.34, 0.0]]), NOBODY, ORIGIN, 0.0, 0.0)[LATER]
+    assert told[AHEAD] == pytest.approx(math.log10(0.8 / (0.34 - 0.24)), abs=1e-5)  # 0.8 of its radius is inside
+    assert told[BACK] == 0.0

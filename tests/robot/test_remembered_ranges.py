@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from rcdsac_trl.robot.dead_reckoning import DeadReckoning
 from rcdsac_trl.robot.foreseen_clearance import ForeseenClearance
 from rcdsac_trl.robot.observation import NUM_REMEMBERED_SECTORS, REMEMBERED_SIZE
-from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.range_sensor import LidarSettings, sensor_mask
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
+from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.world.sim.lidar import sector_distances
 
 PERIOD_S = 0.14
@@ -224,3 +225,17 @@ def test_places_are_where_things_are() -> None:
     walking = RememberedRanges(NARROW, memory_s=12.0)
     walk_past(walking, 30)
     assert walking.places((0.0, 0.0, 0.0))[1] == pytest.approx(np.array([[1.5, 2.0 - 0.07 * 29, 0.25]]), abs=0.1)
+
+
+def test_another_robot_remembers_as_far_as_it_sees_from_its_own_inside() -> None:
+    cart = RobotSettings("cart", "disc", 0.3, None, lidar=LidarSettings(max_range_m=5.0))
+    remembered = RememberedRanges(NARROW, 12.0, cart)
+    told = remembered.observe(at_bin(2, 4.5), 0.0, 0.0, 0.0)
+    assert sectors(told) == {0: pytest.approx(math.log10(4.76 / (4.5 - 0.24)), abs=1e-3)}
+    # Backwards at 0.5 m/s with a blind sensor: within 5 m it stays known, beyond it is forgotten.
+    blind = np.zeros(180, np.bool_)
+    remembered.observe(NOTHING, -0.5, 0.0, PERIOD_S, blind)
+    told = [remembered.observe(NOTHING, -0.5, 0.0, PERIOD_S, blind) for _ in range(10)]
+    known = [bool(each[0]) for each in told]
+    assert known == [4.5 + (0.5 + at) * 0.07 < 5.0 for at in range(1, 11)]
+    assert not all(known)

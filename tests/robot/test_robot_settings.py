@@ -73,9 +73,10 @@ def test_an_agent_is_evaluated_with_its_own_robot_alone(tiny_run: Path) -> None:
             look_at_evaluation(cfg)
         return str(raised.value)
 
-    told = f"is not what {tiny_run} drives: it was trained for robot=paper as it was then, leave robot out"
-    assert spoken("robot=jackal") == f"robot=jackal {told}"
-    assert spoken("robot.lidar.max_range_m=4") == f"robot=paper {told}"
+    told = f"is not what {tiny_run} drives: it was trained for"
+    assert spoken("robot=jackal") == f"robot=jackal {told} robot=paper, leave robot out"
+    assert spoken("robot.max_speed_m_per_s=1") == f"robot=paper {told} robot.max_speed_m_per_s=0.6, leave robot out"
+    assert spoken("robot.lidar.max_range_m=4") == f"robot=paper {told} robot.lidar.max_range_m=3.0, leave robot out"
     look_at_evaluation(compose("evaluate", [f"run={tiny_run}", "beta=[-1]", "robot=paper"]))
     look_at_evaluation(compose("evaluate", ["baseline=dwa", "robot=jackal", "robot.lidar.x_m=0.1"]))
 
@@ -86,6 +87,17 @@ def test_every_robot_there_is_can_drive_the_default_maps(name: str) -> None:
     assert settings.robot.name == name
     assert settings.training_world.robot == settings.robot
     assert RobotSettings.from_mapping(as_lists(asdict(settings.robot))) == settings.robot
+
+
+def test_a_robot_of_ones_own_lies_in_a_folder_of_ones_own(tmp_path: Path) -> None:
+    """As docs/your-robot.md says, for who has installed the package."""
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "mine.yaml").write_text("defaults: [paper, _self_]\nname: mine\nmax_speed_m_per_s: 0.4\n")
+    chosen = [f"hydra.searchpath=[{tmp_path}]", "robot=mine", "robot.max_turn_deg_per_s=60"]
+    settings = training_settings(compose("train", ["+algo=sac", *chosen]))
+    mine = replace(PAPER, name="mine", max_speed_m_per_s=0.4, max_turn_deg_per_s=60)
+    assert settings.robot == mine
+    assert compose("evaluate", ["baseline=dwa", *chosen]).robot.name == "mine"
 
 
 # ------------------------------------------------------------------------------------------------ shapes

@@ -28,6 +28,10 @@ def test_what_is_no_setting_and_no_option_is_refused() -> None:
     for odd in ("9", True, None):
         with pytest.raises(UserInputError, match=r"sensor\.memory_s=.* is no number: give seconds"):
             NavigationGymEnv(memory_s=odd)
+    with pytest.raises(UserInputError, match="robot='jackal' is no robot: give a RobotSettings"):
+        NavigationGymEnv(robot="jackal")
+    with pytest.raises(UserInputError, match=r"map_settings='room\.json' are none: give a MapSettings, or FileMap"):
+        NavigationGymEnv(map_settings="room.json")
     env = NavigationGymEnv(map_settings=SMALL, memory_s=np.float32(9.0))
     for options in ("x", 5, ["episode"]):
         with pytest.raises(UserInputError, match="are no dictionary"):

@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -376,12 +377,17 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         text("a.yaml", "resolution: 0.05\norigin: [0, 0, 0]\n"),
         "image is None, not the name of a PGM or PNG",
     ),
+    "endless yaml": (text("a.yaml", "[" * 3000), "cannot be read as YAML"),
     "no yaml": (text("a.yaml", "a: [1"), "cannot be read as YAML"),
     "yaml of nothing": (text("a.yaml", ""), "holds no keys"),
     "movingai header": (text("a.map", "type octile\nheight 2\nmap\n..\n..\n"), "is no map of MovingAI"),
     "movingai lines": (
         text("a.map", "type octile\nheight 3\nwidth 2\nmap\n..\n..\n"),
-        "says height 3 and width 2, but holds 2 lines of 2 cells",
+        "says height 3 and width 2, but holds 2 lines of 2 cells$",
+    ),
+    "movingai without lines": (
+        text("a.map", "type octile\nheight 3\nwidth 2\nmap\n"),
+        "says height 3 and width 2, but holds 0 lines$",
     ),
     "movingai letters": (text("a.map", "type octile\nheight 1\nwidth 3\nmap\n.x.\n"), "has 'x' in 1 cells"),
     "world without xml": (text("a.world", "<sdf"), "cannot be read as SDF"),
@@ -398,9 +404,42 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda path: write_world(path.with_name("a.world"), [(0, 0, 0.1)], roll=1.57),
         "only an upright cylinder",
     ),
+    "world with an include": (
+        text("a.world", "<sdf><world><include><uri>model://table</uri></include></world></sdf>"),
+        "includes 'model://table', which is not read",
+    ),
+    "world with a model in a model": (
+        text("a.world", "<sdf><world><model name='set'><model name='post'/></model></world></sdf>"),
+        "the model set holds another one, which is not read",
+    ),
+    "world with a pose elsewhere": (
+        text("a.world", "<sdf><world><model name='a'><pose relative_to='b'>1 2 0 0 0 0</pose></model></world></sdf>"),
+        "a pose is relative to 'b', which is not read",
+    ),
+    "world of no size": (
+        lambda path: write_world(path.with_name("a.world"), [(0, 0, 0.0)]),
+        "the radius of cylinder_0 is 0, and must be above 0",
+    ),
     "json": (text("a.json", "{"), "is no map: Expecting"),
     "json without a size": (text("a.json", '{"walls": []}'), "is no map: 'size_m' is missing"),
-    "json with a strange key": (text("a.json", '{"size_m": 9, "doors": []}'), "is no map: .*doors"),
+    "json with a strange key": (
+        text("a.json", '{"size_m": 9, "doors": []}'),
+        "is no map: there is no key doors, a map has layout",
+    ),
+    "json with a strange key of a box": (
+        text("a.json", '{"size_m": 9, "boxes": [{"x": 1, "y": 1, "half": 1}]}'),
+        "is no map: there is no key half, what is in boxes has x, y, half_x",
+    ),
+    "json with a number for a box": (text("a.json", '{"size_m": 9, "boxes": [3]}'), "3 in boxes is no section with"),
+    "json of null": (text("a.json", "null"), "is no map: it holds no keys"),
+    "json with a mover of no size": (
+        text("a.json", '{"size_m": 9, "movers": [{"radius": 0, "speed_m_per_s": 1}]}'),
+        "radius in movers is 0, not a number from 0.05 to 9",
+    ),
+    "json with a mover that stands": (
+        text("a.json", '{"size_m": 9, "movers": [{"radius": 0.2, "speed_m_per_s": 0}]}'),
+        "speed_m_per_s in movers is 0, not a number from 0.05 to 2",
+    ),
     "json outside": (
         text("a.json", '{"size_m": 9, "cylinders": [{"x": 10, "y": 1, "radius": 1}]}'),
         "x in cylinders is 10, not a number from 0 to 9",
@@ -427,6 +466,9 @@ def test_what_cannot_serve_is_told_in_one_sentence(tmp_path: Path, case: str) ->
     [
         ({"path": None}, r"map\.path names no map"),
         ({"path": []}, r"map\.path names no map"),
+        ({"path": 3}, r"map\.path names no map"),
+        ({"path": "a", "start": "abc"}, r"map\.start=abc must be 3 numbers"),
+        ({"path": "a", "mover_radius_m": 0.2}, r"map\.mover_radius_m is 0\.2 but must be two numbers"),
         ({"path": "a", "unknown": "perhaps"}, r"map\.unknown=perhaps must be one of occupied, free"),
         ({"path": "a", "cell_m": math.nan}, r"map\.cell_m is nan but must be a number from 0\.01 to 10"),
         ({"path": "a", "start": [1.0, 2.0]}, r"map\.start=\[1\.0, 2\.0\] must be 3 numbers"),
@@ -458,6 +500,36 @@ def test_a_start_or_goal_where_no_robot_can_be(tmp_path: Path, place: dict, sent
     path = write_map_server(tmp_path / "a.yaml", cells)
     with pytest.raises(UserInputError, match=sentence):
         building(path, **place)
+
+
+def test_movers_that_fit_nowhere_are_told_before_anything_is_driven(tmp_path: Path) -> None:
+    """A corridor of 0.66 m, in which the robot has 0.3 m to both sides, and movers of 0.3 m need 0.35 m."""
+    cells = np.kron(room(8, 62), np.ones((11, 11), np.uint8))
+    cells[33:, 11:-11] = OCCUPIED
+    corridor = write_map_server(tmp_path / "a.yaml", cells, resolution=0.03)
+    check_file_maps(FileMapSettings(path=str(corridor)), 4.0)
+    with pytest.raises(UserInputError, match=r"a\.yaml: no place is 0\.35 m clear .* movers of 0\.3 m need: make them"):
+        check_file_maps(FileMapSettings(path=str(corridor), num_movers=1), 4.0)
+
+
+def test_numbers_of_a_header_may_be_text(tmp_path: Path) -> None:
+    """PyYAML takes 5e-2 for text, the YAML of map_server for a number."""
+    plain, odd = (write_map_server(tmp_path / f"{name}.yaml", room(90, 90)) for name in "ab")
+    odd.write_text(odd.read_text().replace("resolution: 0.1", "resolution: 1e-1"))
+    assert replace(building(odd), layout="a") == building(plain)
+
+
+def test_a_path_need_not_be_text(tmp_path: Path) -> None:
+    path = write_map_server(tmp_path / "a.yaml", room(90, 90))
+    assert FileMapSettings(path=path) == FileMapSettings(path=str(path))  # type: ignore[arg-type]
+
+
+def test_clutter_where_nothing_has_a_back_to_stand_at(tmp_path: Path) -> None:
+    """Shelves stand at walls, and a ring of posts has none."""
+    ring = [{"x": 6 + 5 * math.cos(k / 14), "y": 6 + 5 * math.sin(k / 14), "radius": 0.3} for k in range(88)]
+    path = tmp_path / "a.json"
+    path.write_text("\ufeff" + json.dumps({"size_m": 12.0, "cylinders": ring}))
+    assert len(building(path, unmapped_clutter_per_m2=0.1).cylinders) > len(ring)
 
 
 def test_paths_that_name_no_map(tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ import pytest
 from skimage.graph import MCP_Geometric
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps import geometry
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import Box, Cylinder, Map, MapSettings, Mover, generate_map
 from rcdsac_trl.world.maps.geometry import (
     CELL_M,
@@ -21,6 +23,7 @@ from rcdsac_trl.world.maps.geometry import (
 from rcdsac_trl.world.maps.grid_search import cheapest_path, farthest_cell, nearest_cell
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.maps.shapes import solid_arrays
+from rcdsac_trl.world.task.world_settings import WorldSettings
 
 HARD = MapSettings(door_width_m=(0.9, 1.2), clutter_per_m2=0.22, mapped_fraction=0.4, num_movers=8)
 CASES = [(MapSettings(), index) for index in range(8)] + [(HARD, index) for index in range(4)]
@@ -445,8 +448,19 @@ def test_goals_that_cannot_be_are_refused() -> None:
 
 
 def test_a_margin_below_the_grid_is_refused() -> None:
-    with pytest.raises(UserInputError, match=r"margin_m=0\.005"):
+    with pytest.raises(UserInputError, match=r"clearance_margin_m=0\.005 .* reaches 0\.25 m .*: raise it to 0\.01$"):
         Planner(room(), margin_m=0.005)
+    with pytest.raises(UserInputError, match=r"=0\.02 .* reaches 0\.05 m from its centre: raise it to 0\.037$"):
+        Planner(room(), robot_radius_m=0.05, margin_m=0.02)
+    Planner(room(), robot_radius_m=0.05, margin_m=0.037)
+
+
+def test_a_small_robot_that_needs_a_wider_margin_is_told_before_anything_is_driven() -> None:
+    mouse = RobotSettings("mouse", "disc", 0.05, None)
+    with pytest.raises(UserInputError, match=r"clearance_margin_m=0\.02 .* raise it to 0\.037$"):
+        WorldSettings(MapSettings(clearance_margin_m=0.02), robot=mouse)
+    with pytest.raises(UserInputError, match=r"clearance_margin_m=0\.02 .* raise it to 0\.037$"):
+        WorldSettings(FileMapSettings(path="a", clearance_margin_m=0.02), robot=mouse)
 
 
 def test_a_map_without_free_space_is_refused() -> None:

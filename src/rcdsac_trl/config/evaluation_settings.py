@@ -174,9 +174,11 @@ class EvaluationSettings:
         """
         robot = _changed(trained.robot, self.robot, "robot")
         if self.run is not None and robot != trained.robot:
+            was = f"robot={trained.robot.name}"
+            if robot.name == trained.robot.name:
+                was = _told_apart(robot.plain(), trained.robot.plain(), "robot")
             raise UserInputError(
-                f"robot={robot.name} is not what {self.run} drives: it was trained for robot={trained.robot.name} as "
-                "it was then, leave robot out"
+                f"robot={robot.name} is not what {self.run} drives: it was trained for {was}, leave robot out"
             )
         return robot
 
@@ -196,6 +198,14 @@ def _changed(section: Section, values: Mapping[str, Any] | None, name: str) -> S
     if not values:
         return section
     return read(type(section), _merged(asdict(section), values), name)
+
+
+def _told_apart(now: Mapping[str, Any], then: Mapping[str, Any], section: str) -> str:
+    """Name the first value of a section that is another now, as it was."""
+    key = next(key for key in then if now[key] != then[key])
+    if isinstance(then[key], Mapping):
+        return _told_apart(now[key], then[key], f"{section}.{key}")
+    return f"{section}.{key}={then[key]}"
 
 
 def _merged(into: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

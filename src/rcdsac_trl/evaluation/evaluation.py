@@ -58,6 +58,10 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     check_maps(chosen.maps, chosen.task.min_path_m, settings.robot_of(trained).circumradius_m)
     worlds = [] if chosen.barn is None else timed(chosen.barn.worlds()[: settings.num_maps])
     num_maps = len(worlds) or settings.num_maps
+    if settings.record and settings.video.map >= num_maps:
+        raise UserInputError(
+            f"video.map={settings.video.map} is not among the {num_maps} worlds that are there: lower it"
+        )
     spec = _spec(settings, trained, chosen)
     if settings.baseline is not None:
         check_baseline(settings.baseline, spec.world.sensor, spec.world.robot)

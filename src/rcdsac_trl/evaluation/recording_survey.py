@@ -30,6 +30,8 @@ Waypoints = Literal["plan", "goal", "trajectory"]
 
 # Recorders stamp with wall time what simulations, and other computers, stamp with a clock of their own.
 _OTHER_CLOCK_S = 5.0
+# A recording that says nothing for so long holds a wrong stamp, or two drives.
+_LONGEST_SILENCE_S = 3600.0
 # Odometry that has moved less is of a robot that stood.
 _SHORTEST_WAY_M = 0.5
 # Points of a trajectory that are nearer than this to the one before are left out.
@@ -137,6 +139,7 @@ class _Findings:
         self.offsets_s: list[float] = []
         self.first_s: dict[str, float] = {}
         self.last_s = -math.inf
+        self.silence_s, self.silent_from_s = 0.0, math.nan
         self.way: list[tuple[float, float]] = []
         self.end: tuple[float, float] = (math.nan, math.nan)
         self.odom_frame, self.base_frame, self.scan_frame = "", "", ""
@@ -144,6 +147,8 @@ class _Findings:
         self.transforms = TransformBuffer()
 
     def take(self, topics: Topics, topic: str, time_s: float, message: Any) -> None:
+        if len(self.first_s) == 2 and time_s - self.last_s > self.silence_s:  # before, nobody is asked
+            self.silence_s, self.silent_from_s = time_s - self.last_s, self.last_s
         self.last_s = max(self.last_s, time_s)
         if topic in (topics.scan, topics.odom):
             self.first_s.setdefault(topic, time_s)
@@ -180,6 +185,12 @@ class _Findings:
         for topic in (topics.scan, topics.odom):
             if topic not in self.first_s:
                 raise UserInputError(f"{recording.path} has no message on {topic}: name another topic")
+        if self.silence_s > _LONGEST_SILENCE_S:
+            since_s = self.silent_from_s - max(self.first_s.values())
+            raise UserInputError(
+                f"{recording.path} says nothing for {self.silence_s:.0f} s, from {since_s:.1f} s on, more than "
+                f"{_LONGEST_SILENCE_S:g} s: is a stamp wrong there? Else cut it in two"
+            )
         for key, read in (("zero_means", "0"), ("nan_means", "NaN")):
             if self.readings[key] and getattr(settings, key) is None:
                 share = self.readings[key] / self.readings["all"]

@@ -86,6 +86,7 @@ def _described(
         "run": settings.run,
         "agent": policy.config.name,
         "sensor": policy.config.sensor,
+        "max_range_m": policy.robot.lidar.max_range_m,
         **agent.described,
         "beta": policy.default_beta if settings.beta is None else settings.beta,
         "zero_means": settings.zero_means,

@@ -1,16 +1,17 @@
 """Runs through BARN's worlds as tables, a world and a condition, beside what others have published."""
 
 import json
+import math
 from pathlib import Path
 
 import pandas as pd
 
 from rcdsac_trl.report.collision_report import write_collisions
+from rcdsac_trl.report.read import BARN
 from rcdsac_trl.report.statistics import Interval, bootstrap
 
 METRICS = ("success", "collision", "timeout", "time_s", "score", "later_score")
 
-_BARN = "barn.json"
 _CONDITION = ("beta", "collision_weight", "beta_controller")
 _WORLDS = 50
 # Percent of the runs that succeed and that collide, of robots with a lidar of 270 degrees and 30 m (Xiao et al., 2022,
@@ -24,7 +25,7 @@ def describe_evaluation(folder: Path) -> str:
     Args:
         folder: that ``evaluate`` wrote.
     """
-    return write_barn(folder) if (folder / _BARN).is_file() else write_collisions(folder)
+    return write_barn(folder) if (folder / BARN).is_file() else write_collisions(folder)
 
 
 def write_barn(folder: Path) -> str:
@@ -34,7 +35,7 @@ def write_barn(folder: Path) -> str:
         folder: with ``runs.csv`` and ``barn.json``.
     """
     runs = pd.read_csv(folder / "runs.csv")
-    described = json.loads((folder / _BARN).read_text(encoding="utf-8"))
+    described = json.loads((folder / BARN).read_text(encoding="utf-8"))
     conditions = [key for key in _CONDITION if key in runs and runs[key].notna().any()]
     by_world = runs.groupby([*conditions, "world"], sort=False, dropna=False)[list(METRICS)].mean().reset_index()
     by_world.to_csv(folder / "worlds.csv", index=False, float_format="%.6g")
@@ -82,7 +83,8 @@ def _line(name: str, found: dict[str, Interval]) -> str:
     shown = f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]"
     timeout, time_s = 100 * found["timeout"].value, found["time_s"].value
     rates = f"{success:>22}{collision:>22}{timeout:>8.1f} %"
-    return f"{name:30}{rates}{time_s:>7.1f} s{shown:>23}{found['later_score'].value:>7.3f}"
+    time = "-" if math.isnan(time_s) else f"{time_s:.1f} s"
+    return f"{name:30}{rates}{time:>9}{shown:>23}{found['later_score'].value:>7.3f}"
 
 
 def _percent(interval: Interval) -> str:

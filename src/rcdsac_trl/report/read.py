@@ -15,6 +15,8 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.statistics import Array
 
 DESCRIPTION = "evaluation.json"
+BARN = "barn.json"
+"""The same of runs through BARN's worlds."""
 COLLISIONS = "collisions.csv"
 TOLD = ("beta", "collision_weight", "beta_controller")
 """Columns that say what an agent was told, as far as an evaluation has them."""
@@ -92,6 +94,10 @@ def find_evaluations(folders: Sequence[Path]) -> list[Path]:
     for folder in folders:
         inside = [folder] if (folder / DESCRIPTION).is_file() else []
         inside += sorted(path.parent for path in folder.glob(f"evaluation/*/{DESCRIPTION}"))
+        if not inside and (folder / BARN).is_file():
+            raise UserInputError(
+                f"{folder} holds runs through BARN's worlds, which its summary.csv sums up: name evaluations on maps"
+            )
         if not inside:
             raise UserInputError(f"{folder} holds no {DESCRIPTION}: evaluate it first, or name another folder")
         found += [path for path in inside if path not in found]

@@ -18,8 +18,6 @@ from rcdsac_trl.report.style import FAINT, GRID, INK, style
 _AGENT, _RECORDED, _MEASURED = "#1d6fd1", "#e9962e", "#9aa3b2"
 _STOPPED, _LIMITED = "#d62839", "#e9b872"
 _TAIL = 0.1
-# Agents see no farther.
-_RANGE_M = 3.0
 # Velocities are drawn from here on both sides of 0, m/s or rad/s: what is less is nothing.
 _LEAST_SHOWN = 0.1
 _NOTE = (
@@ -100,11 +98,11 @@ def replay_figure(commands: pd.DataFrame, seen: pd.DataFrame, described: dict[st
     _draw_velocity(panels[1], commands, "omega_rad_per_s", "angular velocity, rad/s")
     _draw_quantiles(panels[2], commands, np.array(described["fractions"]))
     panels[3].plot(commands["time_s"], commands["nearest_m"], color=_AGENT, linewidth=1.2)
-    panels[3].set_ylim(0.0, 1.05 * _RANGE_M)
+    panels[3].set_ylim(0.0, 1.05 * described["max_range_m"])
     style(panels[3], "nearest thing sensed, m", "time, s")
     for axes in panels:
         _shade(axes, commands)
-    _draw_way(figure.add_subplot(grid[:, 1]), commands, seen)
+    _draw_way(figure.add_subplot(grid[:, 1]), commands, seen, described["max_range_m"])
     handles = [
         first.plot([], [], color=color, linewidth=width, label=label)[0]
         for color, width, label in (
@@ -198,7 +196,7 @@ def _shade(axes: Axes, commands: pd.DataFrame) -> None:
         )
 
 
-def _draw_way(axes: Axes, commands: pd.DataFrame, seen: pd.DataFrame) -> None:
+def _draw_way(axes: Axes, commands: pd.DataFrame, seen: pd.DataFrame, max_range_m: float) -> None:
     placed = commands.dropna(subset=["x_m"])
     axes.scatter(seen["x_m"], seen["y_m"], s=3, color=INK, marker="s", linewidths=0, zorder=1)
     axes.plot(placed["x_m"], placed["y_m"], color=FAINT, linewidth=1.6, zorder=1)
@@ -213,4 +211,4 @@ def _draw_way(axes: Axes, commands: pd.DataFrame, seen: pd.DataFrame) -> None:
             axes.annotate(name, (end["x_m"], end["y_m"]), (7, 4), textcoords="offset points", fontsize=9, color=INK)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.1)
-    style(axes, f"where the robot was, and what it saw within {_RANGE_M:g} m", "x, m", "y, m")
+    style(axes, f"where the robot was, and what it saw within {max_range_m:g} m", "x, m", "y, m")

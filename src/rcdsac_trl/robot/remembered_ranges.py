@@ -45,9 +45,8 @@ class RememberedRanges:
     Args:
         sensed: which of the 180 sectors the sensor has, bool [180].
         memory_s: age at which a point is forgotten, above 0, s.
-        max_range_m: reach of the sensor.
-        inner_radius_m: of a circle inside the robot, whose sides are 0.23 m from its middle: nearness counts from
-            there, so that it changes fast where the robot nearly touches.
+        robot: its sensor's reach; its limits; and a circle inside it, of 0.2 m in the paper's robot, whose sides are
+            0.23 m from its middle: nearness counts from there, so that it changes fast where the robot nearly touches.
 
     Example:
         >>> from rcdsac_trl.robot.range_sensor import sensor_mask
@@ -122,8 +121,8 @@ class RememberedRanges:
 
         Returns:
             float32 [84]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
-            degrees, counter-clockwise from straight ahead: log10((R - r) / (distance - r)) with the sensor's reach R,
-            3 m, and the inner radius r, 0.2 m; 0 where nothing is known within R.
+            degrees, counter-clockwise from straight ahead: log10((R - r) / (distance - r)) with the sensor's reach R
+            and the inner radius r, 3 m and 0.2 m of the paper's robot; 0 where nothing is known within R.
             Then, for each of the two nearest things that move: its nearness, that times the cosine and the sine of its
             bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
             Last, for each of 19 commands, how near it would lead to all that soon, and then later; see

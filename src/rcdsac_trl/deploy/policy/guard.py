@@ -89,6 +89,7 @@ class Guard:
     def __post_init__(self) -> None:
         """Refuse what is no limit."""
         check_switches(self, "blind_reverse")
+        _check_robot(self.robot)
         for name in ("max_speed_m_per_s", "max_reverse_m_per_s", "max_turn_rad_per_s", "margin_m", "reaction_s"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise UserInputError(f"{name}={getattr(self, name)} of the guard must be a number of 0 or more")
@@ -113,6 +114,7 @@ class Guard:
             >>> Guard.of(PAPER, margin_m=0.1) == Guard(margin_m=0.1)
             True
         """
+        _check_robot(robot)
         limits: dict[str, Any] = {
             "max_speed_m_per_s": robot.max_speed_m_per_s,
             "max_reverse_m_per_s": robot.max_reverse_m_per_s,
@@ -205,6 +207,11 @@ class Guard:
         on_the_way, headings = _directions(omega, moving[1], reacting, steps, turning)
         np.cumsum(covered_m[:, :, None] * on_the_way, axis=1, out=places[:, 1:])
         return places, headings
+
+
+def _check_robot(robot: object) -> None:
+    if not isinstance(robot, RobotSettings):
+        raise UserInputError(f"robot={robot!r} of the guard is none: give policy.robot, or a RobotSettings")
 
 
 def _until_it_stands(v: float, now: float, reacting: int, acceleration: float) -> list[float]:

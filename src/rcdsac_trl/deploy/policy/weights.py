@@ -271,7 +271,7 @@ def read_weights(folder: Path) -> Weights:
         version, digest = values.pop("format_version"), values.pop("weights_sha256")
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
         raise UserInputError(f"{path} cannot be read ({type(error).__name__}): export the agent anew") from error
-    if version not in _UNSAID:
+    if not isinstance(version, int) or version not in _UNSAID:
         raise UserInputError(
             f"{folder} is of format {version}, this version reads 1 to {FORMAT_VERSION}: export it anew"
         )

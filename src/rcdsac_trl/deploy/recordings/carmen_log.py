@@ -84,6 +84,8 @@ class CarmenLog:
         try:
             if name in ("robot_front_laser_max", "robot_frontlaser_max"):
                 self._range_max_m = float(value)
+                if not self._range_max_m > 0.0:
+                    raise ValueError("a reach is above 0 m")
             elif name in ("robot_frontlaser_offset", "robot_front_laser_offset"):
                 self.mount = Mount(x_m=float(value))
         except ValueError as error:  # of a Mount, too
@@ -120,6 +122,8 @@ Read = tuple[Any, tuple[float, float, float], tuple[float, float] | None, float]
 def _flaser(words: list[str], range_max_m: float) -> Read:
     """Read ``FLASER n r_1 .. r_n x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``."""
     rays = int(words[1])
+    if rays < 2:
+        raise ValueError(f"{rays} readings make no half turn")
     ranges = [float(word) for word in words[2 : 2 + rays]]
     rest = words[2 + rays :]
     if len(ranges) < rays or len(rest) < 7:

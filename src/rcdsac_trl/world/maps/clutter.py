@@ -124,7 +124,7 @@ class ClutterSite:
     def _draw(self, mapped: bool, rng: np.random.Generator) -> Piece:
         """Draw a piece and a place for it, which may turn out to be impossible."""
         kind = rng.choice(len(_WEIGHTS[mapped]), p=_WEIGHTS[mapped])
-        if kind == 0:
+        if kind == 0 and self._walls:
             return _shelf(self._walls, mapped, rng)
         if self.pieces and rng.random() < _GROUPED:
             beside = self.pieces[rng.integers(len(self.pieces))]

@@ -33,7 +33,17 @@ _SLACK = 1.03  # a little cost is given for fewer corners, else many lie a step 
 
 def leg_clearance_m(clearance_m: float, cell_m: float = CELL_M) -> float:
     """Return the clearance of every leg between neighbouring cells of at least ``clearance_m``, m."""
-    return math.sqrt(clearance_m**2 - 0.5 * cell_m**2)
+    return math.sqrt(max(clearance_m**2 - 0.5 * cell_m**2, 0.0))
+
+
+def least_margin_m(robot_radius_m: float, cell_m: float = CELL_M) -> float:
+    """Return the least margin beyond a robot's radius with which no leg between free cells comes nearer than that, m.
+
+    Example:
+        >>> round(least_margin_m(0.25), 3), round(least_margin_m(0.05), 3)
+        (0.01, 0.037)
+    """
+    return math.hypot(robot_radius_m, cell_m * math.sqrt(0.5)) - robot_radius_m
 
 
 @njit

@@ -1,5 +1,6 @@
 """Limits of the numbers that maps are made from: one sentence that names the value and its limits."""
 
+from collections.abc import Sequence
 from numbers import Real
 
 from rcdsac_trl.errors import UserInputError
@@ -33,8 +34,9 @@ def check_range(name: str, value: tuple[float, ...], low: float, high: float) ->
     Raises:
         UserInputError: naming what is wrong.
     """
-    if len(value) != 2:
-        raise UserInputError(f"{name} is {list(value)} but must be two numbers, smallest and largest")
+    if not isinstance(value, Sequence) or len(value) != 2:
+        given = list(value) if isinstance(value, tuple) else value
+        raise UserInputError(f"{name} is {given} but must be two numbers, smallest and largest")
     for end in value:
         check_number(name, end, low, high)
     if value[0] > value[1]:

@@ -9,6 +9,7 @@ A path is always given as its corners, float64 [k, 2] in m, without the start an
 """
 
 import itertools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.maps.geometry import (
     CELL_M,
     ROBOT_RADIUS_M,
+    least_margin_m,
     leg_clearance_m,
     lower_clearance,
     pull_tight,
@@ -30,6 +32,19 @@ Point = NDArray[np.float64] | tuple[float, float]
 _TIGHT_COST = 3.0  # what a metre costs more where there is no room beyond the margin
 _ROUNDING_M = 1e-9
 _MAX_DRAWS = 1000
+
+
+def check_margin(margin_m: float, robot_radius_m: float) -> None:
+    """Refuse a margin with which a robot could touch things between two free cells.
+
+    Raises:
+        UserInputError: naming the least one.
+    """
+    if margin_m < (least_m := least_margin_m(robot_radius_m)):
+        raise UserInputError(
+            f"map.clearance_margin_m={margin_m:g} is less than a grid of {CELL_M:g} m needs for a robot that reaches "
+            f"{robot_radius_m:.3g} m from its centre: raise it to {math.ceil(1000.0 * least_m) / 1000.0:g}"
+        )
 
 
 class _Layer:
@@ -152,8 +167,7 @@ class Planner:
         """
         margin_m = map.clearance_margin_m if margin_m is None else margin_m
         clearance_m = robot_radius_m + margin_m
-        if not leg_clearance_m(clearance_m) >= robot_radius_m:
-            raise UserInputError(f"margin_m={margin_m} is less than a grid of {CELL_M:g} m needs: raise it to 0.02")
+        check_margin(margin_m, robot_radius_m)
         self.map = map
         self.robot_radius_m = robot_radius_m
         self._true = _Layer(map, clearance_m, clearance_m, reachable_only=True)

@@ -8,7 +8,7 @@ per episode by whoever needs them, but for a start and a goal that somebody chos
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from typing import Any, Literal
 
@@ -99,6 +99,10 @@ def _sides(boxes: Sequence[Box]) -> NDArray[np.float64]:
 
 Kind = Literal["outer_wall", "inner_wall", "mapped_clutter", "unmapped_clutter"]
 """What something that stands is; see :meth:`Map.kind`."""
+
+# What a mover has at least, its radius in m and its speed in m/s, and at most, as far as its place does not say it.
+_LEAST_OF_A_MOVER = 0.05
+_MOST_OF_A_MOVER = {"speed_m_per_s": 2.0}
 
 # How near to the map's border a wall must reach to be an outer one.
 _BORDER_M = 1e-6
@@ -218,13 +222,28 @@ def map_of_values(values: dict[str, Any]) -> Map:
     if version != FORMAT_VERSION:
         raise ValueError(f"its format is {version!r}, only {FORMAT_VERSION} can be read")
     for key, part in (("boxes", Box), ("cylinders", Cylinder), ("movers", Mover)):
-        data[key] = tuple(part(**item) for item in data[key])
+        data[key] = tuple(_part(part, key, item) for item in data[key])
     for key in ("start", "goal"):
         if data.get(key) is not None:
             data[key] = tuple(data[key])
+    _check_keys(Map, "a map", data)
     map_ = Map(**data)
     _check_read(map_)
     return map_
+
+
+def _part(kind: type, where: str, values: Any) -> Any:
+    if not isinstance(values, dict):
+        raise ValueError(f"{values!r} in {where} is no section with keys")
+    _check_keys(kind, f"what is in {where}", values)
+    return kind(**values)
+
+
+def _check_keys(kind: type, what: str, values: dict[str, Any]) -> None:
+    """Refuse keys that something does not have, with a ValueError."""
+    known = [field.name for field in fields(kind)]
+    if strange := [key for key in values if key not in known]:
+        raise ValueError(f"there is no key {strange[0]}, {what} has {', '.join(known)}")
 
 
 def _check_read(map_: Map) -> None:
@@ -249,6 +268,8 @@ def _check_read(map_: Map) -> None:
             if name in ("mapped", "wall"):
                 if not isinstance(value, bool):
                     raise ValueError(f"{name} in {where} is {value!r}, neither true nor false")
+            elif isinstance(part, Mover):
+                _check_number(f"{name} in {where}", value, _LEAST_OF_A_MOVER, _MOST_OF_A_MOVER.get(name, map_.size_m))
             elif name == "yaw":
                 _check_number(f"yaw in {where}", value, -2 * math.pi, 2 * math.pi)
             else:

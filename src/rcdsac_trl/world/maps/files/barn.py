@@ -120,6 +120,8 @@ def optimal_time_s(world: Path) -> float:
     files = [folder / name for folder in (world.parent, world.parent / "path_files")]
     try:
         cells = np.load(next(file for file in files if file.is_file())).astype(np.float64)
+        if cells.ndim != 2 or cells.shape[1] != 2 or not np.isfinite(cells).all():
+            raise ValueError(f"its shape is {list(cells.shape)}, and a path has two finite numbers a cell")
     except StopIteration:
         raise UserInputError(f"{files[0]} is missing, and BARN's score needs it: {_SOURCE}") from None
     except (OSError, ValueError) as error:

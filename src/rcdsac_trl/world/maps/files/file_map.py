@@ -1,18 +1,20 @@
 """Maps from files: the settings they are drawn from, and the map of an index: the building, and what is put into it."""
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from numbers import Real
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.clutter import ClutterSite
-from rcdsac_trl.world.maps.files.floor_plan import FloorPlan, FreeFloor, free_floor
+from rcdsac_trl.world.maps.files.floor_plan import FloorPlan, FreeFloor, free_cells, free_floor
 from rcdsac_trl.world.maps.files.map_files import check_digests, map_files
 from rcdsac_trl.world.maps.files.map_json import read_map_json
 from rcdsac_trl.world.maps.files.map_server import Unknown, read_map_server
@@ -81,7 +83,9 @@ class FileMapSettings:
         for name in ("path", "sha256", "start", "goal", "mover_radius_m", "mover_speed_m_per_s"):
             if isinstance(value := getattr(self, name), Sequence) and not isinstance(value, str):
                 object.__setattr__(self, name, tuple(value))
-        if not self.path or not all([self.path] if isinstance(self.path, str) else self.path):
+        object.__setattr__(self, "path", _as_text(self.path))
+        paths = self.path if isinstance(self.path, tuple) else (self.path,)
+        if not paths or not all(isinstance(path, str) and path for path in paths):
             raise UserInputError(
                 "map.path names no map: give it a file (.yaml of map_server, .map, .world, .json), a folder, or a list"
             )
@@ -90,8 +94,9 @@ class FileMapSettings:
         check_number("map.cell_m", self.cell_m, 0.01, 10.0)
         for name, numbers in (("start", 3), ("goal", 2)):
             value = getattr(self, name)
-            if value is not None and (len(value) != numbers or not all(map(math.isfinite, value))):
-                raise UserInputError(f"map.{name}={list(value)} must be {numbers} numbers")
+            if value is not None and not _are_numbers(value, numbers):
+                given = list(value) if isinstance(value, tuple) else value
+                raise UserInputError(f"map.{name}={given} must be {numbers} numbers")
         check_number("map.unmapped_clutter_per_m2", self.unmapped_clutter_per_m2, 0.0, 1.0)
         check_whole("map.num_movers", self.num_movers, 0, 50)
         check_range("map.mover_radius_m", self.mover_radius_m, 0.05, 0.4)
@@ -104,6 +109,21 @@ class FileMapSettings:
     def clearance_m(self, robot_radius_m: float) -> float:
         """Return what a place must be clear of everything to be free for a robot, m."""
         return robot_radius_m + self.clearance_margin_m
+
+
+def _as_text(path: object) -> Any:
+    """Return paths as text, one or several; what is none stays as it is."""
+    if isinstance(path, tuple):
+        return tuple(_as_text(each) for each in path)
+    return os.fspath(path) if isinstance(path, os.PathLike) else path
+
+
+def _are_numbers(value: object, count: int) -> bool:
+    return (
+        isinstance(value, tuple)
+        and len(value) == count
+        and all(isinstance(number, Real) and math.isfinite(number) for number in value)
+    )
 
 
 def file_map(
@@ -252,7 +272,7 @@ def _check_place(
     if not floor.connected[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].any():
         raise UserInputError(
             f"{file}: map.{name}={given} is not on the largest connected floor, {floor.area_m2:.0f} m² "
-            "large: move it there"
+            "large: move it there, or drive a smaller robot"
         )
 
 
@@ -271,6 +291,7 @@ def check_file_maps(settings: FileMapSettings, min_path_m: float, robot_radius_m
     check_digests(settings.sha256, files, all_of_them=True)
     for file in files:
         building, floor = read_building(settings, file, robot_radius_m)
+        _check_movers(settings, file, building)
         if building.start is not None and building.goal is not None:
             continue
         # The ends of the longest way: from any place one of them is at least half of it away.
@@ -286,11 +307,24 @@ def check_file_maps(settings: FileMapSettings, min_path_m: float, robot_radius_m
             )
 
 
+def _check_movers(settings: FileMapSettings, file: Path, building: Map) -> None:
+    """Refuse movers that fit nowhere."""
+    radii_m = [mover.radius for mover in building.movers] + [settings.mover_radius_m[1]] * (settings.num_movers > 0)
+    if not radii_m:
+        return
+    need_m = max(radii_m) + settings.clearance_margin_m
+    if not free_cells(building, need_m).any():
+        raise UserInputError(
+            f"{file}: no place is {need_m:g} m clear of everything, which movers of {max(radii_m):g} m need: make them "
+            "smaller (map.mover_radius_m), or leave them out"
+        )
+
+
 def described(settings: FileMapSettings, file: Path) -> str:
-    """Put a file's map into a sentence."""
+    """Put a file's map, and what the paper's robot can use of it, into a sentence."""
     building, floor = read_building(settings, file)
     pieces = f"{len(building.boxes)} boxes and {len(building.cylinders)} cylinders"
     return (
-        f"{file}: a square of {building.size_m:.1f} m with {pieces}; this robot fits on "
+        f"{file}: a square of {building.size_m:.1f} m with {pieces}; the paper's robot fits on "
         f"{floor.area_m2:.0f} m², {100 * floor.share:.1f} % of its floor, connected"
     )

@@ -170,6 +170,14 @@ class FreeFloor(NamedTuple):
         return float(self.connected.sum()) * CELL_M**2
 
 
+def free_cells(map_: Map, clearance_m: float) -> NDArray[np.bool_]:
+    """Return which cells of a map are so far from everything that stands, bool [side, side]."""
+    side = round(map_.size_m / CELL_M)
+    field = np.full((side, side), clearance_m)
+    lower_clearance(field, *map_.solids(), clearance_m, CELL_M)
+    return field >= clearance_m
+
+
 def free_floor(map_: Map, clearance_m: float) -> FreeFloor:
     """Return where a robot fits.
 
@@ -180,10 +188,7 @@ def free_floor(map_: Map, clearance_m: float) -> FreeFloor:
     Raises:
         UserInputError: it fits nowhere.
     """
-    side = round(map_.size_m / CELL_M)
-    field = np.full((side, side), clearance_m)
-    lower_clearance(field, *map_.solids(), clearance_m, CELL_M)
-    labels, parts = label_components(field >= clearance_m)
+    labels, parts = label_components(free_cells(map_, clearance_m))
     if not parts:
         raise UserInputError(
             f"{map_.layout}: of {map_.size_m:.1f} x {map_.size_m:.1f} m no place is {clearance_m:g} m clear of "

@@ -31,7 +31,9 @@ def read_map_json(path: Path, *, mapped: bool) -> FloorPlan:
         UserInputError: the file is no such map.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(path.read_text(encoding="utf-8-sig"))
+        if not isinstance(values, dict):
+            raise ValueError("it holds no keys")
         extent_m = _extent_m(values["size_m"])
         map_ = map_of_values(_completed(values, path.stem, extent_m, mapped))
     except KeyError as error:
@@ -61,12 +63,17 @@ def _completed(values: dict[str, Any], name: str, extent_m: tuple[float, float],
     thickness_m = values.pop("wall_thickness_m", _WALL_M)
     walls = [_wall(ends, thickness_m) for ends in values.pop("walls", [])]
     values = {"layout": name} | _DEFAULTS | values | {"size_m": max(extent_m)}
-    values["boxes"] = [*_beside(*extent_m), *walls, *(_BOX | box for box in values["boxes"])]
-    values["cylinders"] = [_CYLINDER | cylinder for cylinder in values["cylinders"]]
+    values["boxes"] = [*_beside(*extent_m), *walls, *_filled(_BOX, values["boxes"])]
+    values["cylinders"] = _filled(_CYLINDER, values["cylinders"])
     if not mapped:
         values["boxes"] = [box | {"mapped": False, "wall": False} for box in values["boxes"]]
         values["cylinders"] = [cylinder | {"mapped": False} for cylinder in values["cylinders"]]
     return values
+
+
+def _filled(defaults: dict[str, Any], parts: Any) -> list[Any]:
+    """Return parts with what they leave out; what is no part is left to whoever reads it."""
+    return [defaults | part if isinstance(part, dict) else part for part in parts]
 
 
 def _beside(width_m: float, height_m: float) -> list[dict[str, Any]]:

@@ -1,5 +1,6 @@
 """Maps of ROS's ``map_server``: a YAML file that says what the cells of an image mean (nav2_map_server, ``map_io``)."""
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -79,7 +80,7 @@ def read_map_server(path: Path, unknown: Unknown, *, mapped: bool) -> FloorPlan:
 def _header(path: Path) -> Mapping[str, Any]:
     try:
         header = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
         raise UserInputError(f"{path} cannot be read as YAML ({' '.join(str(error).split())})") from error
     if not isinstance(header, Mapping):
         raise UserInputError(f"{path} holds no keys: a map's YAML file has image, resolution and origin")
@@ -88,6 +89,9 @@ def _header(path: Path) -> Mapping[str, Any]:
 
 def _number(path: Path, header: Mapping[str, Any], key: str, default: float | None, low: float, high: float) -> float:
     value = header.get(key, default)
+    if isinstance(value, str):  # as map_server does; PyYAML takes 5e-2 for text
+        with contextlib.suppress(ValueError):
+            value = float(value)
     # The comparison is false for NaN too.
     if not isinstance(value, int | float) or not low <= value <= high:
         raise UserInputError(f"{path}: {key}={value} must be a number from {low:g} to {high:g}")

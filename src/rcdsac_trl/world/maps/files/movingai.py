@@ -35,8 +35,8 @@ def read_movingai(path: Path, cell_m: float, *, mapped: bool) -> FloorPlan:
     grid = [line for line in lines[first:] if line]
     lengths = {len(line) for line in grid}
     if len(grid) != rows or lengths != {columns}:
-        found = f"{len(grid)} lines of {' or '.join(map(str, sorted(lengths)))}"
-        raise UserInputError(f"{path} says height {rows} and width {columns}, but holds {found} cells")
+        found = f"{len(grid)} lines" + (f" of {' or '.join(map(str, sorted(lengths)))} cells" if grid else "")
+        raise UserInputError(f"{path} says height {rows} and width {columns}, but holds {found}")
     cells = np.frombuffer(b"".join(grid), np.uint8).reshape(rows, columns)
     occupied = np.isin(cells, np.frombuffer(_OCCUPIED, np.uint8))
     strange = ~occupied & ~np.isin(cells, np.frombuffer(_FREE, np.uint8))

@@ -15,6 +15,8 @@ AROUND_PLACES_M = 2.0
 """Floor around a start and a goal."""
 
 _UPRIGHT_RAD = 1e-3
+# Models of Gazebo's own that nearly every world includes.
+_NO_OBSTACLES = ("ground_plane", "sun")
 
 
 def read_sdf_world(path: Path, places: Sequence[tuple[float, float]], *, mapped: bool) -> FloorPlan:
@@ -34,6 +36,7 @@ def read_sdf_world(path: Path, places: Sequence[tuple[float, float]], *, mapped:
         raise UserInputError(f"{path} cannot be read as SDF ({error})") from error
     if world is None:
         raise UserInputError(f"{path} holds no <world>")
+    _refuse_includes(path, world)
     circles = [circle for model in world.findall("model") for circle in _circles(path, model)]
     if not circles:
         raise UserInputError(f"{path}: no upright cylinder stands in it, and only those can be read")
@@ -54,9 +57,19 @@ def read_sdf_world(path: Path, places: Sequence[tuple[float, float]], *, mapped:
     return enclosed(path.stem, extent_m, [], cylinders, (corner_x, corner_y, 0.0))
 
 
+def _refuse_includes(path: Path, world: ElementTree.Element) -> None:
+    """Refuse what lies in other files, but for what nobody collides with."""
+    for include in world.iter("include"):
+        uri = include.findtext("uri", "").strip()
+        if uri.rstrip("/").rpartition("/")[2] not in _NO_OBSTACLES:
+            raise UserInputError(f"{path} includes {uri!r}, which is not read: put its cylinders here, or take it out")
+
+
 def _circles(path: Path, model: ElementTree.Element) -> list[tuple[float, float, float]]:
     """Return x, y and radius of a model's cylinders, m."""
     found = []
+    if model.find("model") is not None:
+        raise UserInputError(f"{path}: the model {model.get('name')} holds another one, which is not read: take it out")
     x, y, *turn = _pose(path, model)
     for collision in model.iter("collision"):
         shapes = [shape.tag for geometry in collision.findall("geometry") for shape in geometry]
@@ -69,13 +82,21 @@ def _circles(path: Path, model: ElementTree.Element) -> list[tuple[float, float,
                 f"read, and it has {' and '.join(shapes) or 'nothing'}: take it out"
             )
         radius = collision.findtext("geometry/cylinder/radius", "")
-        found.append((x, y, _numbers(path, radius, 1)[0]))
+        radius_m = _numbers(path, radius, 1)[0]
+        if not radius_m > 0.0:
+            raise UserInputError(f"{path}: the radius of {model.get('name')} is {radius_m:g}, and must be above 0")
+        found.append((x, y, radius_m))
     return found
 
 
 def _pose(path: Path, element: ElementTree.Element) -> list[float]:
     """Return x, y, z, roll, pitch and yaw without z."""
-    x, y, _, *turn = _numbers(path, element.findtext("pose", "0 0 0 0 0 0"), 6)
+    pose = element.find("pose")
+    if pose is None:
+        return [0.0] * 5
+    if beside := {pose.get(key) for key in ("relative_to", "frame")} - {None, "", "world"}:
+        raise UserInputError(f"{path}: a pose is relative to {beside.pop()!r}, which is not read: give it in the world")
+    x, y, _, *turn = _numbers(path, pose.text or "", 6)
     return [x, y, *turn]
 
 
