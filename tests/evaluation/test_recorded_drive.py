@@ -5,6 +5,7 @@ import math
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,8 @@ from rcdsac_trl.evaluation.recorded_drive import RecordedDrive, row_of, seen_fro
 from rcdsac_trl.evaluation.recording_survey import survey
 from rcdsac_trl.evaluation.replay_run import make_replay
 from rcdsac_trl.report.replay_report import causes_table, summary_table, write_replay
+from rcdsac_trl.robot.range_sensor import LidarSettings
+from rcdsac_trl.robot.robot_settings import PAPER
 from robots import agent
 
 PERIOD_S = 0.14
@@ -135,6 +138,17 @@ def test_what_zeros_mean_is_what_the_agent_sees(tmp_path: Path) -> None:
     }
     assert nearest["far"] == nearest["invalid"] == pytest.approx(1.5, abs=0.002)
     assert nearest["near"] == pytest.approx(0.3, abs=0.002)  # range_min of 0.1 m before a scanner at 0.2 m
+
+
+def test_a_sensor_is_read_as_far_as_the_agents_robot_sees(bags: dict[str, Path]) -> None:
+    recording, chosen = open_recording(bags["mcap"]), settings(bags["mcap"])
+    far = replace(PAPER, lidar=LidarSettings(max_range_m=6.0))
+    farthest = []
+    for robot in (PAPER, far):
+        run = RecordedDrive(recording, survey(recording, chosen), Policy(agent(robot=robot)), chosen)
+        seen = [period.sectors.distances_m for period in run.periods() if period.sectors is not None]
+        farthest.append(max(distances[np.isfinite(distances)].max() for distances in seen))
+    assert farthest[0] < 3.0 < farthest[1] < 6.0
 
 
 def test_what_is_seen_lies_where_the_walls_are(bags: dict[str, Path]) -> None:

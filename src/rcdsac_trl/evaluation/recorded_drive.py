@@ -128,10 +128,17 @@ class RecordedDrive:
             now_s - self._found.began_s,
             command,
             situation,
-            None if command.stopped or situation is None else _sectors(situation.ranges),
+            None if command.stopped or situation is None else self._sectors(situation.ranges),
             self._measured,
             self._recorded,
         )
+
+    def _sectors(self, ranges: Scan | Sectors) -> Sectors:
+        """Return what the sensor said as the agent's robot reads it."""
+        if not isinstance(ranges, Scan):
+            return ranges
+        robot = self._driver.policy.robot
+        return scan_sectors(ranges, body_radius_m=robot.body_radius_m, max_range_m=robot.lidar.max_range_m)
 
 
 def row_of(period: RecordedPeriod) -> dict[str, Any]:
@@ -180,7 +187,3 @@ def path_message(points: NDArray[np.float64], frame: str) -> Any:
         header=SimpleNamespace(frame_id=frame, stamp=SimpleNamespace(sec=0, nanosec=0)),
         poses=[SimpleNamespace(pose=place) for place in places],
     )
-
-
-def _sectors(ranges: Scan | Sectors) -> Sectors:
-    return scan_sectors(ranges) if isinstance(ranges, Scan) else ranges
