@@ -347,13 +347,18 @@ def test_contact_sheet_draws_every_map() -> None:
         assert len(axes.patches) == len(map_.boxes) + len(map_.cylinders) + len(map_.movers) + 1
 
 
+def draw(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> None:
+    """Run the command in a folder."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else it starts this process again
+    monkeypatch.setattr(sys, "argv", ["draw_maps", *overrides])
+    draw_maps.main()
+
+
 def test_draw_maps_writes_the_picture_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else it starts this process again
-    monkeypatch.setattr(sys, "argv", ["draw_maps", "out=maps.png", "count=1", "map=static"])
-    draw_maps.main()
+    draw(monkeypatch, tmp_path, "out=maps.png", "count=1", "map=static")
     assert capsys.readouterr().out.strip() == "drew 1 maps: maps.png"
     assert [path.name for path in tmp_path.iterdir()] == ["maps.png"]
     with Image.open(tmp_path / "maps.png") as image:
@@ -363,16 +368,12 @@ def test_draw_maps_writes_the_picture_and_nothing_else(
 def test_draw_maps_writes_maps_that_can_be_read_and_says_what_files_hold(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")  # else it starts this process again
-    monkeypatch.setattr(sys, "argv", ["draw_maps", "count=2", "map=easy", "json=drawn"])
-    draw_maps.main()
+    draw(monkeypatch, tmp_path, "count=2", "map=easy", "json=drawn")
     settings = FileMapSettings(path="drawn")
     assert [path.name for path in map_files("drawn")] == ["train-0.json", "train-1.json"]
     assert file_map(settings, "train", 0, 1) == generate_map(MapSettings(**conf("easy")), "train", 0, 1)
     capsys.readouterr()
-    monkeypatch.setattr(sys, "argv", ["draw_maps", "count=1", "map=file", "map.path=drawn", "out=again.png"])
-    draw_maps.main()
+    draw(monkeypatch, tmp_path, "count=1", "map=file", "map.path=drawn", "out=again.png")
     told = capsys.readouterr().out.splitlines()
     assert re.match(
         r"drawn/train-0\.json: a square of 20\.0 m with \d+ boxes and \d+ cylinders; .* m², 100\.0 % ", told[0]

@@ -17,7 +17,8 @@ from rcdsac_trl.world.maps.clutter import ClutterSite
 from rcdsac_trl.world.maps.geometry import CELL_M, ROBOT_RADIUS_M
 from rcdsac_trl.world.maps.grid_search import label_components
 from rcdsac_trl.world.maps.layouts import build_walls
-from rcdsac_trl.world.maps.map_checks import check_number, check_range, check_whole
+from rcdsac_trl.world.maps.map_additions import check_additions, draw_movers
+from rcdsac_trl.world.maps.map_checks import check_number, check_range
 from rcdsac_trl.world.maps.shapes import CLEARANCE_MARGIN_M, WAYPOINT_CLEARANCE_M, Box, Cylinder, Map, Mover
 
 __all__ = ["LAYOUTS", "SPLITS", "Box", "Cylinder", "Map", "MapSettings", "Mover", "Split", "generate_map"]
@@ -89,18 +90,13 @@ class MapSettings:
         unknown = [name for name in self.layouts if name not in LAYOUTS]
         if unknown or not self.layouts:
             raise UserInputError(f"layouts is {list(self.layouts)} but must name at least one of {', '.join(LAYOUTS)}")
-        check_whole("num_movers", self.num_movers, 0, 50)
+        check_additions(self)
         check_number("size_m", self.size_m, 10.0, 60.0)
         check_number("clutter_per_m2", self.clutter_per_m2, 0.0, 1.0)
         check_number("mapped_fraction", self.mapped_fraction, 0.0, 1.0)
-        check_number("clearance_margin_m", self.clearance_margin_m, 0.02, 0.2)
-        check_number("waypoint_clearance_m", self.waypoint_clearance_m, 0.0, 2.0)
-        check_number("detour_m", self.detour_m, 0.2, 3.0)
         passage_m = _passage_m(ROBOT_RADIUS_M, self.clearance_margin_m)
         check_range("corridor_width_m", self.corridor_width_m, passage_m, 5.0)
         check_range("door_width_m", self.door_width_m, passage_m, 2.0)
-        check_range("mover_radius_m", self.mover_radius_m, 0.05, 0.4)
-        check_range("mover_speed_m_per_s", self.mover_speed_m_per_s, 0.05, 2.0)
 
 
 def _passage_m(robot_radius_m: float, margin_m: float) -> float:
@@ -164,10 +160,7 @@ def generate_map(
     num_mapped = round(count * settings.mapped_fraction)
     site.fill(num_mapped, True, rng)
     site.fill(count - num_mapped, False, rng)
-    movers = tuple(
-        Mover(float(rng.uniform(*settings.mover_radius_m)), float(rng.uniform(*settings.mover_speed_m_per_s)))
-        for _ in range(settings.num_movers)
-    )
+    movers = draw_movers(settings, rng)
     return Map(
         layout=layout,
         size_m=float(settings.size_m),

@@ -22,8 +22,9 @@ from rcdsac_trl.world.maps.files.movingai import read_movingai
 from rcdsac_trl.world.maps.files.sdf_world import read_sdf_world
 from rcdsac_trl.world.maps.geometry import CELL_M, ROBOT_RADIUS_M, segment_clearance
 from rcdsac_trl.world.maps.grid_search import farthest_cell
-from rcdsac_trl.world.maps.map_checks import check_number, check_range, check_whole
-from rcdsac_trl.world.maps.shapes import CLEARANCE_MARGIN_M, WAYPOINT_CLEARANCE_M, Box, Cylinder, Map, Mover
+from rcdsac_trl.world.maps.map_additions import check_additions, draw_movers
+from rcdsac_trl.world.maps.map_checks import check_number
+from rcdsac_trl.world.maps.shapes import CLEARANCE_MARGIN_M, WAYPOINT_CLEARANCE_M, Box, Cylinder, Map
 
 _PLANS_KEPT = 64
 # Steps over cells are up to this much longer than the way pulled tight.
@@ -98,12 +99,7 @@ class FileMapSettings:
                 given = list(value) if isinstance(value, tuple) else value
                 raise UserInputError(f"map.{name}={given} must be {numbers} numbers")
         check_number("map.unmapped_clutter_per_m2", self.unmapped_clutter_per_m2, 0.0, 1.0)
-        check_whole("map.num_movers", self.num_movers, 0, 50)
-        check_range("map.mover_radius_m", self.mover_radius_m, 0.05, 0.4)
-        check_range("map.mover_speed_m_per_s", self.mover_speed_m_per_s, 0.05, 2.0)
-        check_number("map.clearance_margin_m", self.clearance_margin_m, 0.02, 0.2)
-        check_number("map.waypoint_clearance_m", self.waypoint_clearance_m, 0.0, 2.0)
-        check_number("map.detour_m", self.detour_m, 0.2, 3.0)
+        check_additions(self, "map.")
         check_number("map.connected_share", self.connected_share, 0.0, 1.0)
 
     def clearance_m(self, robot_radius_m: float) -> float:
@@ -145,10 +141,7 @@ def file_map(
     building, floor = read_building(settings, files[index % len(files)], robot_radius_m)
     rng = stream(seed, f"file map/{split}", index)
     pieces = _clutter(settings, building, floor, robot_radius_m, rng)
-    movers = [
-        Mover(float(rng.uniform(*settings.mover_radius_m)), float(rng.uniform(*settings.mover_speed_m_per_s)))
-        for _ in range(settings.num_movers)
-    ]
+    movers = draw_movers(settings, rng)
     return replace(
         building,
         boxes=(*building.boxes, *(piece for piece in pieces if isinstance(piece, Box))),
