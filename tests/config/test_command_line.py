@@ -129,7 +129,7 @@ def test_an_evaluation_changes_single_keys_of_what_was_trained() -> None:
     for plus in ("", "+"):
         overrides = ["run=x", f"{plus}task.episode_steps=200", f"{plus}map.num_movers=0"]
         settings = read_config(compose("evaluate", overrides), EvaluationSettings)
-        maps, sensor, task, _ = settings.world_of(trained)
+        maps, sensor, task, *_ = settings.world_of(trained)
         assert (task.episode_steps, task.range_dropout) == (200, 0.1)
         assert (maps.num_movers, maps.clutter_per_m2) == (0, trained.map.clutter_per_m2)
         assert sensor == trained.sensor
@@ -137,7 +137,7 @@ def test_an_evaluation_changes_single_keys_of_what_was_trained() -> None:
     settings = read_config(
         compose("evaluate", ["run=x", "map=easy", "map.num_movers=1", "task=default"]), EvaluationSettings
     )
-    maps, _, task, _ = settings.world_of(trained)
+    maps, _, task, *_ = settings.world_of(trained)
     easy = training_settings(compose("train", [POW, "map=easy", "map.num_movers=1"]))
     assert (maps, task.range_dropout) == (easy.map, 0.0)
     assert default_training().map.num_movers == 4

@@ -87,12 +87,14 @@ class ChosenWorld(NamedTuple):
         maps: what maps are made from.
         sensor: what the agents see.
         task: what they are to do.
+        robot: which one drives.
         barn: the worlds of BARN's protocol, where that is driven; maps and task then follow from it.
     """
 
     maps: MapSource
     sensor: SensorSettings
     task: TaskSettings
+    robot: RobotSettings
     barn: BarnMapSettings | None = None
 
 
@@ -154,24 +156,23 @@ class EvaluationSettings:
         runtime.resolve_threads(self.threads)
 
     def world_of(self, trained: TrainingSettings) -> ChosenWorld:
-        """Return map set, sensor and task: those of a training, with what was chosen in their place.
+        """Return map set, sensor, task and robot: those of a training, with what was chosen in their place.
 
         Raises:
-            UserInputError: for a key or a value that they do not have, and worlds of BARN that are not there.
+            UserInputError: for a key or a value that they do not have, worlds of BARN that are not there, and another
+                robot than an agent was trained for.
         """
         maps = _changed_maps(trained.map, self.map)
         sensor, task = _changed(trained.sensor, self.sensor, "sensor"), _changed(trained.task, self.task, "task")
+        robot = self._robot_of(trained)
         if not isinstance(maps, BarnMapSettings):
-            return ChosenWorld(maps, sensor, task)
-        steps = math.ceil(TIME_LIMIT_S / (min(task.motor_steps) * self.robot_of(trained).motor_period_s))
-        return ChosenWorld(maps.files(), sensor, replace(task, goal_radius_m=GOAL_RADIUS_M, episode_steps=steps), maps)
+            return ChosenWorld(maps, sensor, task, robot)
+        steps = math.ceil(TIME_LIMIT_S / (min(task.motor_steps) * robot.motor_period_s))
+        task = replace(task, goal_radius_m=GOAL_RADIUS_M, episode_steps=steps)
+        return ChosenWorld(maps.files(), sensor, task, robot, maps)
 
-    def robot_of(self, trained: TrainingSettings) -> RobotSettings:
-        """Return the robot: that of a training, or for a baseline the one that was chosen.
-
-        Raises:
-            UserInputError: for a key or a value that it does not have, and another robot than an agent was trained for.
-        """
+    def _robot_of(self, trained: TrainingSettings) -> RobotSettings:
+        """Return the robot: that of a training, or for a baseline the one that was chosen."""
         robot = _changed(trained.robot, self.robot, "robot")
         if self.run is not None and robot != trained.robot:
             was = f"robot={trained.robot.name}"

@@ -36,9 +36,8 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     if settings.run is not None:
         trained.algo.conditions(settings.beta, settings.collision_weight)
     chosen = settings.world_of(trained)
-    robot = settings.robot_of(trained)
-    WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=robot)
-    check_maps(chosen.maps, chosen.task.min_path_m, robot.circumradius_m)
+    WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=chosen.robot)
+    check_maps(chosen.maps, chosen.task.min_path_m, chosen.robot.circumradius_m)
     _look_at_out(settings.out)
 
 

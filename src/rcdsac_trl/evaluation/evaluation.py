@@ -55,7 +55,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
     named = None if settings.run is None else named_agent(settings.run, settings.checkpoint)
     trained = default_training() if named is None else named.settings
     chosen = settings.world_of(trained)
-    check_maps(chosen.maps, chosen.task.min_path_m, settings.robot_of(trained).circumradius_m)
+    check_maps(chosen.maps, chosen.task.min_path_m, chosen.robot.circumradius_m)
     worlds = [] if chosen.barn is None else timed(chosen.barn.worlds()[: settings.num_maps])
     num_maps = len(worlds) or settings.num_maps
     if settings.record and settings.video.map >= num_maps:
@@ -205,5 +205,5 @@ def _evaluation_world(
         num_agents=settings.num_episodes * num_conditions,
         num_workers=0,  # a process drives whole maps
         gui=settings.gui,
-        robot=settings.robot_of(trained),
+        robot=chosen.robot,
     )
