@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.action import clip_command, desired_velocities
-from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
+from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
 from rcdsac_trl.robot.range_sensor import Sensor, sensor_mask
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.rollout.planners.controller import Controller
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.sim.lidar import sector_distances
@@ -49,7 +50,7 @@ class Scene:
 
     def move(self, v: float, omega: float) -> None:
         """Hold two desired velocities for an agent step."""
-        action = (2.0 * (v + 0.2) / (MAX_LINEAR_VELOCITY + 0.2) - 1.0, omega / MAX_ANGULAR_VELOCITY)
+        action = (2.0 * (v + 0.2) / (MAX_LINEAR_VELOCITY + 0.2) - 1.0, omega / PAPER.max_angular_velocity)
         v_u, omega_u = desired_velocities(action)
         v_c, omega_c = self.velocity[:2]
         x, y, yaw = self.pose

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.foreseen_clearance import MIRRORED_COMMANDS, ForeseenClearance
-from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
+from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MIN_LINEAR_VELOCITY
 from rcdsac_trl.robot.observation import NUM_FORESEEN_COMMANDS
-from rcdsac_trl.robot.robot_settings import RobotSettings
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
 NOBODY = np.empty((0, 6))
 ORIGIN = np.zeros(3)
@@ -35,7 +35,7 @@ def test_the_commands_are_what_their_names_say() -> None:
     assert COMMANDS[[AHEAD, HALF_AHEAD, BACK]].tolist() == [[0.6, 0.0], [0.3, 0.0], [-0.2, 0.0]]
     assert COMMANDS[:, 0].min() >= MIN_LINEAR_VELOCITY
     assert COMMANDS[:, 0].max() == MAX_LINEAR_VELOCITY
-    assert np.abs(COMMANDS[:, 1]).max() == MAX_ANGULAR_VELOCITY
+    assert np.abs(COMMANDS[:, 1]).max() == PAPER.max_angular_velocity
     assert sorted(MIRRORED_COMMANDS) == list(range(len(COMMANDS)))
 
 

@@ -39,10 +39,10 @@ def test_the_paper_robot_has_the_papers_numbers() -> None:
     assert yaml_of("robot/paper.yaml") == as_lists(asdict(PAPER))
     assert training_settings(tiny_cfg("sac")).robot == PAPER
     assert (PAPER.min_linear_velocity, PAPER.max_speed_m_per_s) == (-0.2, 0.6)
-    assert PAPER.max_angular_velocity == limits.MAX_ANGULAR_VELOCITY == math.radians(90.0)
+    assert PAPER.max_angular_velocity == math.radians(90.0)
     assert PAPER.max_acceleration_m_per_s2 == limits.MAX_LINEAR_ACCELERATION == 1.5
-    assert PAPER.max_angular_acceleration == limits.MAX_ANGULAR_ACCELERATION == math.radians(120.0)
-    assert PAPER.dead_band == limits.DEAD_BAND == math.radians(15.0)
+    assert PAPER.max_angular_acceleration == math.radians(120.0)
+    assert PAPER.dead_band == math.radians(15.0)
     assert (PAPER.motor_period_s, PAPER.circumradius_m, PAPER.body_radius_m) == (0.02, 0.25, 0.2)
     # Nothing is scaled: 1.0 times a number is that number.
     assert (PAPER.reward_per_speed, PAPER.reward_per_turn) == (1.0, 1.0)

@@ -17,10 +17,11 @@ from tensordict import TensorDict
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
-from rcdsac_trl.robot.limits import MAX_ANGULAR_VELOCITY, MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
+from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.rollout.planners.baselines import baseline_policy, check_baseline
 from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
 from rcdsac_trl.rollout.planners.cost_to_go import cost_to_go
@@ -51,7 +52,7 @@ def turned(local_map: LocalMap, scene: Scene, turn: float, steps: int) -> None:
     """Turn the robot on the spot, while its map watches."""
     local_map.observe(scene.observation()[0])
     for _ in range(steps):
-        scene.move(0.0, math.copysign(MAX_ANGULAR_VELOCITY, turn))
+        scene.move(0.0, math.copysign(PAPER.max_angular_velocity, turn))
         local_map.move(*scene.velocity[:2], PERIOD_S)
         local_map.observe(scene.observation()[0])
 
@@ -284,15 +285,15 @@ def test_what_was_seen_and_is_out_of_view_still_costs() -> None:
         known = TrajectoryCosts(settings, NARROW, 20)
         known.observe(*scene.observation())
         for _ in range(10):
-            scene.move(0.0, MAX_ANGULAR_VELOCITY)
+            scene.move(0.0, PAPER.max_angular_velocity)
             known.observe(*scene.observation())
         while abs(scene.velocity[1]) > 0:
             scene.move(0.0, 0.0)
             known.observe(*scene.observation())
         assert np.isinf(scene.observation()[0]).all()
         back_to_it = np.full((1, 20, 2), (0.6, 0.0))
-        turn = round(scene.pose[2] / MAX_ANGULAR_VELOCITY / PERIOD_S)
-        back_to_it[0, :turn] = 0.0, -MAX_ANGULAR_VELOCITY
+        turn = round(scene.pose[2] / PAPER.max_angular_velocity / PERIOD_S)
+        back_to_it[0, :turn] = 0.0, -PAPER.max_angular_velocity
         costs[memory_s] = known.of(back_to_it)[0]
     assert costs[8.0] > costs[0.5] + CostSettings().collision_m
 

@@ -1,7 +1,5 @@
 """Limits and motor period of the paper's robot (section "Actions"); see :class:`.robot_settings.RobotSettings`."""
 
-import math
-
 # Actions (paper, section "Actions").
 MIN_LINEAR_VELOCITY = -0.2
 """w_minv, m/s."""
@@ -12,13 +10,11 @@ MAX_LINEAR_VELOCITY = 0.6
 
 
 MAX_TURN_DEG_PER_S = 90.0
-MAX_ANGULAR_VELOCITY = math.radians(MAX_TURN_DEG_PER_S)
-"""w_maxomega, rad/s."""
+"""w_maxomega, degrees/s."""
 
 
 DEAD_BAND_DEG_PER_S = 15.0
-DEAD_BAND = math.radians(DEAD_BAND_DEG_PER_S)
-"""Desired angular velocities below this are taken as 0, rad/s."""
+"""Desired angular velocities below this are taken as 0, degrees/s."""
 
 
 MAX_LINEAR_ACCELERATION = 1.5
@@ -26,8 +22,7 @@ MAX_LINEAR_ACCELERATION = 1.5
 
 
 MAX_TURN_ACCELERATION_DEG_PER_S2 = 120.0
-MAX_ANGULAR_ACCELERATION = math.radians(MAX_TURN_ACCELERATION_DEG_PER_S2)
-"""w_accomega, rad/s^2."""
+"""w_accomega, degrees/s^2."""
 
 
 MOTOR_PERIOD_S = 0.02
