@@ -11,7 +11,7 @@ each other: they meet in these keys, each with the shape of one agent's entry.
 | `range` | 180 f32 | 2.5 + log10 m: 0, or 0.5 to 2.98 | env | encoders, planners |
 | `waypoint` | 6 f32 | log10 m, cos, sin; of the next two | env | encoders, pursuit, planners |
 | `velocity` | 4 f32 | m/s, rad/s measured; m/s, rad/s desired | env | encoders, planners, metrics |
-| `remembered` | 84 f32 | what it saw before; with `sensor.memory_s` | env | encoders |
+| `remembered` | 90 f32 | what it saw before; with `sensor.memory_s` | env | encoders |
 | `action` | 2 f32 | -1 to 1 | actor | env, critics |
 | `risk` | 1 f32 | raw beta | EpisodeSampler, Relabel | actor, critics, psi |
 | `collision_weight` | 1 f32 | w_coll, RCWR only | EpisodeSampler | encoders, env, replay |

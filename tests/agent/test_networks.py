@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from rcdsac_trl.agent.kernels.recurrent_kernels import _GatedRecurrence, gated_r
 from rcdsac_trl.agent.networks import (
     ActorHead,
     Encoder,
+    LookAhead,
     NetworkSettings,
     QuantileHead,
     RangeFeatures,
@@ -27,7 +29,8 @@ from rcdsac_trl.agent.networks import (
 )
 from rcdsac_trl.agent.risk import CVaR, PowerLaw
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
+from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, look_ahead
+from rcdsac_trl.robot.observation import REMEMBERED_SIZE, VECTOR_OBSERVATIONS
 from rcdsac_trl.robot.ring import Padding
 
 SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
@@ -289,6 +292,63 @@ def test_conditioned_heads_ask_for_risk() -> None:
         ActorHead(2, SMALL, CVaR())(memory)
     with pytest.raises(ValueError, match="conditioned on risk"):
         QuantileHead(2, SMALL, CVaR())(memory, torch.rand(1, 1, 2), torch.rand(1, 1, 3))
+
+
+# ------------------------------------------------------------------------------------------------ look ahead
+AHEAD = replace(SMALL, look_ahead=True, restart_steps=2)
+WITH_MEMORY = {**VECTOR_OBSERVATIONS, "remembered": REMEMBERED_SIZE, "collision_weight": 1}
+
+
+def test_look_ahead_is_that_of_the_robot_and_its_slopes_are_right() -> None:
+    memory, action = torch.rand(3, 4, 7 + FORESEEN_SIZE), 2.0 * torch.rand(3, 4, 2) - 1.0
+    expected = [
+        look_ahead(m, u) for m, u in zip(memory.flatten(0, 1).numpy(), action.flatten(0, 1).numpy(), strict=True)
+    ]
+    told = LookAhead()(memory, action)
+    np.testing.assert_allclose(told.flatten(0, 1).numpy(), expected, atol=1e-6)
+    inputs = (memory.double().requires_grad_(), action.double().requires_grad_())
+    assert torch.autograd.gradcheck(LookAhead().double(), inputs)
+
+
+@pytest.mark.parametrize("sequences", [2, 20])  # more than a few go through the compiled twins
+def test_heads_read_the_foreseen_clearances_of_the_newest_observation(sequences: int) -> None:
+    sizes = {"range": 180, **WITH_MEMORY}
+    inputs = [torch.rand(sequences, 4, size) for size in sizes.values()]
+    encoder, plain = Encoder(WITH_MEMORY, AHEAD), Encoder(WITH_MEMORY, replace(AHEAD, look_ahead=False))
+    plain.load_state_dict(encoder.state_dict())
+    memory = dispatch.forward(encoder, *inputs)
+    assert memory.shape[-1] == encoder.memory_size == Encoder.memory_size_of(AHEAD) == SMALL.memory + FORESEEN_SIZE
+    torch.testing.assert_close(memory[..., : SMALL.memory], plain(*inputs))
+    assert torch.equal(memory[..., SMALL.memory :], inputs[3][..., -FORESEEN_SIZE:])
+    state = torch.zeros(sequences, AHEAD.state_size)
+    for t in range(4):
+        is_init = torch.full((sequences, 1), t == 0)
+        read, state = dispatch.step(encoder, *(x[:, t] for x in inputs), is_init, state)
+        torch.testing.assert_close(read, memory[:, t])
+
+
+@pytest.mark.parametrize("kind", ["quantile", "scalar"])
+def test_a_critic_is_told_how_near_its_action_leads(kind: Literal["quantile", "scalar"]) -> None:
+    """Its value moves with what is foreseen of the action, along a slope that its compiled twin has, too."""
+    measure = PowerLaw() if kind == "quantile" else None
+    head = build_critic(2, WITH_MEMORY, kind, measure, AHEAD)[1].module.double()
+    memory = torch.rand(3, 4, SMALL.memory + FORESEEN_SIZE).double()
+    action = (2.0 * torch.rand(3, 4, 2) - 1.0).double().requires_grad_()
+    told = [] if measure is None else [torch.rand(3, 1, 5).double(), -torch.rand(3, 1, 1).double()]
+    plain, fast = head(memory, action, *told), dispatch.forward(head, memory, action, *told)
+    torch.testing.assert_close(fast, plain)
+    torch.testing.assert_close(gradients(fast, [action]), gradients(plain, [action]))
+    assert torch.autograd.gradcheck(lambda u: head(memory, u, *told), (action,))
+    with torch.no_grad():
+        head.input.weight[:, -2:] = 0.0
+    assert not torch.allclose(head(memory, action, *told), plain)
+
+
+def test_who_looks_ahead_needs_a_memory_and_our_encoder() -> None:
+    with pytest.raises(UserInputError, match=r"set sensor\.memory_s above 0"):
+        Encoder(VECTORS, AHEAD)
+    with pytest.raises(UserInputError, match=r"set it to false with network\.encoder=encoders\."):
+        NetworkSettings(look_ahead=True, encoder="encoders.TwoLayers")
 
 
 # ------------------------------------------------------------------------------------------------ keys

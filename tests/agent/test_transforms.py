@@ -212,7 +212,7 @@ def test_the_mirrored_world_is_told_mirrored(sensor: str) -> None:
 
 
 def test_mirroring_twice_changes_nothing() -> None:
-    keys = {"range": 180, "waypoint": 6, "velocity": 4, "remembered": 84, "action": 2}
+    keys = {"range": 180, "waypoint": 6, "velocity": 4, "remembered": 90, "action": 2}
     batch = TensorDict({key: torch.randn(2, 3, size) for key, size in keys.items()}, [2, 3])
     mirror = Mirror(torch.ones(180, dtype=torch.bool))
     once = mirror(batch.clone())

@@ -144,6 +144,7 @@ def refusal(
         ),
         ([POW, "logger.backends=csv"], "logger.backends=csv must be a list of words in brackets"),
         # what does not go together
+        ([POW, "sensor.memory_s=0"], "network.look_ahead=true reads what is remembered: set sensor.memory_s above 0"),
         (
             [POW, "collector=parallel_env", "world.num_agents=10", "world.num_workers=3"],
             "num_workers=3 cannot share 10 agents evenly",

@@ -203,7 +203,7 @@ def test_time_passes_for_what_is_remembered_while_calls_without_stamps_are_refus
     policy.act(OPEN, AHEAD, [0.6, 0.0])
     for _ in range(2):
         policy.act(None, AHEAD, [0.6, 0.0])
-    with patch.object(RememberedRanges, "observe", return_value=np.zeros(84, np.float32)) as observe:
+    with patch.object(RememberedRanges, "observe", return_value=np.zeros(90, np.float32)) as observe:
         policy.act(OPEN, AHEAD, [0.6, 0.0])
     assert observe.call_args.args[3] == pytest.approx(3 * 0.14)
 

@@ -31,7 +31,8 @@ FILES = PROGRAMS | {"README.md", "config.json", "training.yaml", "weights.safete
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROWS)
 def test_programs_of_the_paper_s_size_agree_over_1000_steps_at_every_beta(name: str) -> None:
-    weights = full_size(**ROWS[name], restart_steps=4 if name == "rcdsac_cvar" else None)
+    remembers = {"restart_steps": 4, "memory_s": 12.0, "look_ahead": True} if name == "rcdsac_cvar" else {}
+    weights = full_size(**ROWS[name], **remembers)
     found = differences(export_agent(weights), weights, betas=betas_of(weights))
     assert max(found.values()) <= LIMIT, found
 
@@ -49,9 +50,8 @@ def shifted(exported: Exported, by: float) -> Exported:
 def test_the_command_writes_a_folder_that_load_reads(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, _, _ = untrained_run(
-        tmp_path / "run", "rcdsac_pow", "network.conv=4", "network.range=8", "network.restart_steps=2"
-    )
+    remembers = "network.restart_steps=2", "sensor.memory_s=12", "network.look_ahead=true"
+    run, _, _ = untrained_run(tmp_path / "run", "rcdsac_pow", "network.conv=4", "network.range=8", *remembers)
     asked = [f"run={run}", "checkpoint=last", "num_quantiles=4"]
     export = make_export(compose("export", asked))
     # An export takes its time: this one serves both runs.

@@ -15,7 +15,7 @@ from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 NOBODY = np.empty((0, 6))
 ORIGIN = np.zeros(3)
 COMMANDS = ForeseenClearance().commands
-SOON, LATER = slice(0, 19), slice(19, 38)
+SOON, LATER = slice(0, 22), slice(22, 44)
 
 
 def foreseen_nearness(*given: Any) -> NDArray[np.float32]:
@@ -23,7 +23,7 @@ def foreseen_nearness(*given: Any) -> NDArray[np.float32]:
     return ForeseenClearance().nearness(*given)[LATER]
 
 
-AHEAD, HALF_AHEAD, BACK = 4, 12, 17
+AHEAD, HALF_AHEAD, STILL, BACK = 4, 12, 17, 20
 
 
 def nearness(distance_m: float) -> float:
@@ -32,7 +32,8 @@ def nearness(distance_m: float) -> float:
 
 def test_the_commands_are_what_their_names_say() -> None:
     assert len(COMMANDS) == NUM_FORESEEN_COMMANDS
-    assert COMMANDS[[AHEAD, HALF_AHEAD, BACK]].tolist() == [[0.6, 0.0], [0.3, 0.0], [-0.2, 0.0]]
+    expected = [[0.6, 0.0], [0.3, 0.0], [0.0, 0.0], [-0.2, 0.0]]
+    np.testing.assert_allclose(COMMANDS[[AHEAD, HALF_AHEAD, STILL, BACK]], expected, atol=1e-12)
     assert COMMANDS[:, 0].min() >= MIN_LINEAR_VELOCITY
     assert COMMANDS[:, 0].max() == MAX_LINEAR_VELOCITY
     assert np.abs(COMMANDS[:, 1]).max() == PAPER.max_angular_velocity
@@ -106,7 +107,8 @@ def test_another_robot_foresees_by_its_own_limits_and_size() -> None:
         "cart", "disc", 0.3, None, max_speed_m_per_s=2.0, max_reverse_m_per_s=0.0, max_acceleration_m_per_s2=2.5
     )
     clearance = ForeseenClearance(cart)
-    assert clearance.commands[[AHEAD, HALF_AHEAD, BACK]].tolist() == [[2.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    # Without a reverse the same actions are another quarter and none of its speed.
+    assert clearance.commands[[AHEAD, HALF_AHEAD, STILL, BACK]].tolist() == [[2.0, 0], [1.25, 0], [0.5, 0], [0.0, 0]]
     went_m = (0.175 + 0.525 + 0.875 + 1.225 + 1.575 + 1.875 + 4 * 2.0) * 0.14
     told = clearance.nearness(np.array([[went_m + 0.34, 0.0]]), NOBODY, ORIGIN, 0.0, 0.0)[LATER]
     assert told[AHEAD] == pytest.approx(math.log10(0.8 / (0.34 - 0.24)), abs=1e-5)  # 0.8 of its radius is inside

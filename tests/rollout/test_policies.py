@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule
 
 from rcdsac_trl.agent.actor import build_policy
+from rcdsac_trl.robot.observation import REMEMBERED_SIZE
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.rollout.planners.pursuit import pursuit_action
@@ -140,6 +141,8 @@ def test_on_device_writes_what_the_policy_writes() -> None:
 
 # ------------------------------------------------------------------------------------------------ the agent's own
 SIZES = {"range": 180, "waypoint": 6, "velocity": 4, "recurrent_state": 128, "risk": 1, "collision_weight": 1}
+SIZES |= {"remembered": REMEMBERED_SIZE}
+REMEMBERS = ["sensor.memory_s=12", "network.look_ahead=true"]
 
 
 def seen(batch: tuple[int, ...], seed: int, sensor: str = "narrow") -> TensorDict:
@@ -159,14 +162,18 @@ def noise_of(number: int) -> AgentNoise:
 
 
 @pytest.mark.parametrize(
-    ("row", "sensor", "restart_steps"), [("rcdsac_pow", "narrow", 2), ("sac", "sparse", None), ("rcwr", "full", None)]
+    ("row", "sensor", "chosen"),
+    [
+        ("rcdsac_pow", "narrow", ["network.restart_steps=2"]),
+        ("sac", "sparse", REMEMBERS),
+        ("rcwr", "full", ["network.restart_steps=3", *REMEMBERS]),
+    ],
 )
 @pytest.mark.parametrize("batch", [(3,), (2, 2)])
 def test_the_lean_policy_is_the_policy_to_rounding(
-    row: str, sensor: str, restart_steps: int | None, batch: tuple[int, ...]
+    row: str, sensor: str, chosen: list[str], batch: tuple[int, ...]
 ) -> None:
-    restarts = f"network.restart_steps={'null' if restart_steps is None else restart_steps}"
-    actor = make_loss(tiny_settings(row, restarts), "cpu").actor_network
+    actor = make_loss(tiny_settings(row, *chosen), "cpu").actor_network
     plain = build_policy(actor, Bounded(-1.0, 1.0, (2,)))
     lean = LeanPolicy(actor, noise_of(math.prod(batch)))
     drawn = noise_of(math.prod(batch))

@@ -35,7 +35,7 @@ def _encoder(vectors: Mapping[str, int], network: NetworkSettings) -> TensorDict
     return TensorDictModule(encoder, in_keys=["range", *vectors], out_keys=[MEMORY_KEY])
 
 
-def _of_heads(network: NetworkSettings) -> NetworkSettings:
+def network_of_heads(network: NetworkSettings) -> NetworkSettings:
     """Return what heads are made of: the memory is what they read of it."""
     return replace(network, memory=encoder_class(network).memory_size_of(network))
 
@@ -65,7 +65,7 @@ def build_actor(
         ['range', 'waypoint', 'velocity', 'risk']
     """
     network = network or NetworkSettings()
-    of_heads = _of_heads(network)
+    of_heads = network_of_heads(network)
     head = TensorDictModule(
         ActorHead(action_size, of_heads, measure),
         in_keys=[MEMORY_KEY] if measure is None else [MEMORY_KEY, "risk"],
@@ -94,7 +94,7 @@ def build_critic(
         UserInputError: for an unknown kind, or a scalar critic with a measure.
     """
     network = network or NetworkSettings()
-    of_heads = _of_heads(network)
+    of_heads = network_of_heads(network)
     head: nn.Module
     if kind == "quantile":
         head = QuantileHead(action_size, of_heads, measure)

@@ -25,9 +25,12 @@ class NetworkSettings:
             :class:`~rcdsac_trl.agent.networks.HistoryEncoder`. None for :class:`~rcdsac_trl.agent.networks.Encoder`.
         restart_steps: our encoder's recurrent state restarts every so many observations, while the one before is read;
             see :class:`~rcdsac_trl.agent.networks.Encoder`. None: it never does.
+        look_ahead: heads read how near what is remembered says that ways lead, critics that of their action as well;
+            see :mod:`rcdsac_trl.robot.look_ahead`.
 
     Raises:
-        UserInputError: if a width or ``restart_steps`` is below 1, or there is no such padding, code or encoder.
+        UserInputError: if a width or ``restart_steps`` is below 1, there is no such padding, code or encoder, or an
+            encoder that is not ours is to look ahead.
     """
 
     conv: int = 32
@@ -40,6 +43,7 @@ class NetworkSettings:
     range_code: RangeCode = "paper"
     encoder: str | None = None
     restart_steps: int | None = None
+    look_ahead: bool = False
 
     def __post_init__(self) -> None:
         """Refuse widths below 1, other readings of the bins, and an encoder that cannot be imported."""
@@ -53,6 +57,11 @@ class NetworkSettings:
         one_of("network.padding", self.padding, Padding)
         one_of("network.range_code", self.range_code, RangeCode)
         if self.encoder is not None:
+            if self.look_ahead:
+                raise UserInputError(
+                    "network.look_ahead=true needs our encoder, which hands on what it is told: set it to false with "
+                    f"network.encoder={self.encoder}"
+                )
             from rcdsac_trl.agent.networks import imported_encoder  # late, since it imports torch
 
             imported_encoder(self.encoder)
@@ -60,7 +69,7 @@ class NetworkSettings:
     @property
     def widths(self) -> dict[str, int]:
         """The sizes of the layers, by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, int) and name != "restart_steps"}
+        return {name: value for name, value in vars(self).items() if type(value) is int and name != "restart_steps"}
 
     @property
     def state_size(self) -> int:

@@ -23,6 +23,7 @@ from rcdsac_trl.agent.float32 import made_in_float32
 from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, HAT_OFFSETS, HAT_SLOPES, NUM_LOOK_AHEAD
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
@@ -120,9 +121,19 @@ class Encoder(HistoryEncoder):
     observations, all of them at an episode's start. What is carried is both, the older first, and how many observations
     the younger has read.
 
+    With ``network.look_ahead`` the heads read one thing more of the newest observation than the memory: the foreseen
+    clearances, which end what is remembered.
+
     Args:
         vectors: as for :class:`HistoryEncoder`; each gets its own linear layer.
         network: sizes of the layers.
+
+    Attributes:
+        foreseen_in: number of the vector observation that foreseen clearances end; None where heads do not read them.
+        foreseen_from: where they begin in all vector observations, one behind the other.
+
+    Raises:
+        UserInputError: if heads are to look ahead and nothing is remembered.
 
     Example:
         >>> encoder = Encoder({"waypoint": 6, "velocity": 4}, NetworkSettings())
@@ -133,22 +144,42 @@ class Encoder(HistoryEncoder):
     def __init__(self, vectors: Mapping[str, int], network: NetworkSettings) -> None:
         """Build the layers."""
         super().__init__(vectors, network)
+        self.foreseen_in: int | None = None
+        self.foreseen_from = 0
+        if network.look_ahead:
+            if "remembered" not in vectors:
+                raise UserInputError("network.look_ahead=true reads what is remembered: set sensor.memory_s above 0")
+            self.foreseen_in = list(vectors).index("remembered")
+            self.foreseen_from = sum(list(vectors.values())[: self.foreseen_in + 1]) - FORESEEN_SIZE
         self.range = RangeFeatures(network.conv, network.range, network.padding, network.range_code)
         self.vectors = nn.ModuleList(nn.Linear(size, network.vector) for size in vectors.values())
         self.gru = nn.GRU(network.range + network.vector * len(vectors), network.memory, batch_first=True)
         self.restart_steps = network.restart_steps
+
+    @classmethod
+    def memory_size_of(cls, network: NetworkSettings) -> int:
+        """Return how many numbers the heads read."""
+        return network.memory + (FORESEEN_SIZE if network.look_ahead else 0)
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
         """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``.
 
         A sequence of up to 2 R + 1 observations, as training unrolls, is read as a whole.
         """
-        return in_turn(lambda features: self.gru(features)[0], self.features(range_, vectors), self.restart_steps)
+        run = in_turn(lambda features: self.gru(features)[0], self.features(range_, vectors), self.restart_steps)
+        return self.with_foreseen(run, vectors)
 
     def step(self, range_: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
         """Advance any batch ``[*]`` of agents by one observation; see :meth:`HistoryEncoder.step`."""
         *vectors, is_init, state = rest
-        return self.advance(self.features(range_, tuple(vectors)), is_init, state)
+        memory, state = self.advance(self.features(range_, tuple(vectors)), is_init, state)
+        return self.with_foreseen(memory, vectors), state
+
+    def with_foreseen(self, memory: Tensor, vectors: Sequence[Tensor]) -> Tensor:
+        """Return what the heads read of a memory ``[*, memory]`` and the vector observations of the same moment."""
+        if self.foreseen_in is None:
+            return memory
+        return torch.cat((memory, vectors[self.foreseen_in][..., -FORESEEN_SIZE:]), dim=-1)
 
     def advance(self, features: Tensor, is_init: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Do the recurrent part of :meth:`step`, from the features ``[*, n]`` of an observation."""
@@ -156,7 +187,7 @@ class Encoder(HistoryEncoder):
         if self.restart_steps is None:
             state = self._read(features, state)
             return state, state
-        older, younger, age = state.split((self.memory_size, self.memory_size, 1), dim=-1)
+        older, younger, age = state.split((self.gru.hidden_size, self.gru.hidden_size, 1), dim=-1)
         is_due = age >= self.restart_steps
         older, younger = torch.where(is_due, younger, older), torch.where(is_due, 0.0, younger)
         older, younger = self._read(torch.stack((features, features)), torch.stack((older, younger)))
@@ -164,7 +195,7 @@ class Encoder(HistoryEncoder):
 
     def _read(self, features: Tensor, state: Tensor) -> Tensor:
         """Return the states ``[*, memory]`` after one observation each."""
-        rows, states = features.reshape(-1, 1, features.shape[-1]), state.reshape(1, -1, self.memory_size)
+        rows, states = features.reshape(-1, 1, features.shape[-1]), state.reshape(1, -1, self.gru.hidden_size)
         return self.gru(rows, states)[1].view(state.shape)
 
     def features(self, range_: Tensor, vectors: Sequence[Tensor]) -> Tensor:
@@ -234,6 +265,34 @@ class CosineFeatures(nn.Module):
         return torch.cos(x.unsqueeze(-1) * self.frequencies)
 
 
+class LookAhead(nn.Module):
+    """What foreseen clearances say of an action; the twin of :func:`rcdsac_trl.robot.look_ahead.look_ahead`."""
+
+    slopes: Tensor
+    offsets: Tensor
+
+    def __init__(self) -> None:
+        """Keep the hat functions as buffers that no checkpoint carries."""
+        super().__init__()
+        self.register_buffer("slopes", torch.from_numpy(HAT_SLOPES), persistent=False)
+        self.register_buffer("offsets", torch.from_numpy(HAT_OFFSETS), persistent=False)
+
+    def forward(self, memory: Tensor, action: Tensor) -> Tensor:
+        """Return how near an action leads, soon and later.
+
+        Args:
+            memory: what the heads read, foreseen clearances last, ``[.., n]``.
+            action: ``[.., 2]``.
+
+        Returns:
+            ``[.., 2]``.
+        """
+        sides = [action.unsqueeze(-1) * slope + offset for slope, offset in zip(self.slopes, self.offsets, strict=True)]
+        first, second = torch.minimum(*sides).clamp(0.0, 1.0).unbind(-2)
+        foreseen = memory[..., -FORESEEN_SIZE:].unflatten(-1, (NUM_LOOK_AHEAD, -1))
+        return (foreseen * (first * second).unsqueeze(-2)).sum(-1)
+
+
 @made_in_float32
 class ActorHead(nn.Module):
     r"""Memory (and ``beta``) to the mean and the standard deviation of the pre-tanh action.
@@ -287,7 +346,8 @@ class QuantileHead(nn.Module):
         """Build the layers."""
         super().__init__()
         self.measure = measure
-        self.input = nn.Linear(network.memory + action_size, network.head)
+        self.look_ahead = LookAhead() if network.look_ahead else None
+        self.input = nn.Linear(network.memory + _told_of_action(action_size, network), network.head)
         self.cosines = CosineFeatures(network.cosines)
         self.gate_tau = nn.Linear(network.cosines, network.head)
         if measure is not None:
@@ -308,7 +368,7 @@ class QuantileHead(nn.Module):
             tau: fractions in [0, 1], ``[B, L, N]`` or, the same along a sequence, ``[B, 1, N]``.
             risk: ``beta``, ``[B, L, 1]`` or ``[B, 1, 1]``; not read without a measure.
         """
-        return self.layers(memory, action, tau, self.beta_cosines(risk))
+        return self.layers(memory, with_look_ahead(self.look_ahead, memory, action), tau, self.beta_cosines(risk))
 
     def beta_cosines(self, risk: Tensor | None) -> Tensor | None:
         """Return the cosines of ``beta``, ``[B, L|1, cosines]``; None without a measure."""
@@ -319,7 +379,7 @@ class QuantileHead(nn.Module):
         return self.cosines(self.measure.embed(risk).squeeze(-1))
 
     def layers(self, memory: Tensor, action: Tensor, tau: Tensor, beta: Tensor | None) -> Tensor:
-        """Do what follows beta's cosines."""
+        """Do what follows beta's cosines and the look ahead, which is a part of the action here."""
         x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
         gate = self.gate_tau(self.cosines(tau))
         if beta is not None:
@@ -339,11 +399,22 @@ class ScalarHead(nn.Module):
     def __init__(self, action_size: int, network: NetworkSettings) -> None:
         """Build the layers."""
         super().__init__()
-        self.input = nn.Linear(network.memory + action_size, network.head)
+        self.look_ahead = LookAhead() if network.look_ahead else None
+        self.input = nn.Linear(network.memory + _told_of_action(action_size, network), network.head)
         self.hidden = nn.Linear(network.head, network.head)
         self.output = nn.Linear(network.head, 1)
 
     def forward(self, memory: Tensor, action: Tensor) -> Tensor:
         """Return the value ``[.., 1]``."""
-        x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
+        told = with_look_ahead(self.look_ahead, memory, action)
+        x = F.relu(self.input(torch.cat((memory, told), dim=-1)))
         return self.output(F.relu(self.hidden(x)))
+
+
+def with_look_ahead(look_ahead: LookAhead | None, memory: Tensor, action: Tensor) -> Tensor:
+    """Return what a critic is told of an action: the action ``[.., 2]``, and what is foreseen of it."""
+    return action if look_ahead is None else torch.cat((action, look_ahead(memory, action)), dim=-1)
+
+
+def _told_of_action(action_size: int, network: NetworkSettings) -> int:
+    return action_size + (NUM_LOOK_AHEAD if network.look_ahead else 0)

@@ -153,6 +153,11 @@ class TrainingSettings:
                 f"learner.sequence_length={sequence_length} is longer than an episode of "
                 f"task.episode_steps={episode_steps} transitions: shorten it"
             )
+        if self.network.look_ahead and self.sensor.memory_s == 0.0:
+            raise UserInputError(
+                "network.look_ahead=true reads what is remembered: set sensor.memory_s above 0, or "
+                "network.look_ahead=false"
+            )
         iteration_steps = self.training_world.num_agents * episode_steps
         if self.replay.capacity_steps < iteration_steps:
             raise UserInputError(

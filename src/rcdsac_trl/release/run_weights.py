@@ -63,9 +63,9 @@ def weights_of_run(folder: Path, checkpoint: Name) -> Weights:
 
 
 def _below(state: Mapping[str, Tensor], prefix: str, new: str) -> dict[str, Tensor]:
-    """Return what lies below a prefix under another; the cosines' frequencies are no weights."""
+    """Return what lies below a prefix under another; what is computed, as cosines' frequencies, is no weight."""
     found = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-    return {new + name: value for name, value in found.items() if not name.startswith("cosines.")}
+    return {new + name: value for name, value in found.items() if not name.startswith(("cosines.", "look_ahead."))}
 
 
 def states_of_weights(weights: Weights) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -124,6 +124,7 @@ def agent_config(
         memory_s=agent.sensor.memory_s,
         range_code=agent.network.range_code,
         restart_steps=agent.network.restart_steps,
+        look_ahead=agent.network.look_ahead,
         robot=agent.robot,
     )
 

@@ -12,17 +12,25 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
 
-# Each row is a speed, as a share of the fastest, and shares of the fastest turn, from right to left.
-_ROWS = ((1.0, np.arange(-4, 5) / 4.0), (0.5, np.arange(-3, 4) / 3.0), (-1.0, np.arange(-1, 2) / 2.0))
-_SHARES = np.array([(speed, turn) for speed, row in _ROWS for turn in row])
+FORESEEN_ACTIONS: tuple[tuple[float, tuple[float, ...]], ...] = (
+    (1.0, (-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0)),
+    (0.25, (-1.0, -2.0 / 3.0, -1.0 / 3.0, 0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0)),
+    (-0.5, (-1.0, 0.0, 1.0)),
+    (-1.0, (-0.5, 0.0, 0.5)),
+)
+"""Rows of actions, each its first number and the second ones from right to left. Of the paper's robot the rows are
+full speed, half of it, standing, and backwards."""
+
+_ACTIONS = np.array([(speed, turn) for speed, turns in FORESEEN_ACTIONS for turn in turns])
 
 MIRRORED_COMMANDS: NDArray[np.intp] = np.array(
-    [int(np.flatnonzero((share * (1.0, -1.0) == _SHARES).all(axis=1))[0]) for share in _SHARES]
+    [int(np.flatnonzero((action * (1.0, -1.0) == _ACTIONS).all(axis=1))[0]) for action in _ACTIONS]
 )
-"""Which command each one is in the mirrored world, intp [19]."""
+"""Which command each one is in the mirrored world, intp [22]."""
 
 _PERIOD_S = 0.14
 # Steps of the horizons: 0.42 and 1.4 s.
@@ -33,28 +41,26 @@ _LEAST_GAP_M = 0.02
 
 
 class ForeseenClearance:
-    """How near each of 19 commands would lead a robot, within 0.42 s and within 1.4 s.
+    """How near each of 22 commands would lead a robot, within 0.42 s and within 1.4 s.
 
     Args:
         robot: its limits, and from where distances count.
 
     Attributes:
-        commands: float64 [19, 2], in m/s and rad/s: full speed, half of it and back, each from right to left.
+        commands: float64 [22, 2], in m/s and rad/s, those of :data:`FORESEEN_ACTIONS`.
 
     Example:
         >>> clearance = ForeseenClearance()
-        >>> clearance.commands[[0, 4, 12, 17]].round(2).tolist()
-        [[0.6, -1.57], [0.6, 0.0], [0.3, 0.0], [-0.2, 0.0]]
+        >>> clearance.commands[[0, 4, 12, 17, 20]].round(2).tolist()
+        [[0.6, -1.57], [0.6, 0.0], [0.3, 0.0], [0.0, 0.0], [-0.2, 0.0]]
         >>> ahead = np.array([[0.84 + 0.28, 0.0]])  # full speed ahead ends 0.28 m before it
         >>> told = clearance.nearness(ahead, np.empty((0, 6)), np.zeros(3), v=0.6, omega=0.0)
-        >>> [round(float(each), 2) for each in told[[4, 19 + 4]]]  # within 0.42 s it comes no nearer than 0.87 m
+        >>> [round(float(each), 2) for each in told[[4, 22 + 4]]]  # within 0.42 s it comes no nearer than 0.87 m
         [0.08, 1.0]
     """
 
     def __init__(self, robot: RobotSettings = PAPER) -> None:
-        forwards, backwards = robot.max_speed_m_per_s, robot.max_reverse_m_per_s
-        speeds = np.where(_SHARES[:, 0] > 0.0, forwards * _SHARES[:, 0], backwards * _SHARES[:, 0])
-        self.commands: NDArray[np.float64] = np.column_stack([speeds, robot.max_angular_velocity * _SHARES[:, 1]])
+        self.commands: NDArray[np.float64] = np.array([desired_velocities(action, robot) for action in _ACTIONS])
         self._changes = robot.max_acceleration_m_per_s2 * _PERIOD_S, robot.max_angular_acceleration * _PERIOD_S
         self._inner_radius_m = robot.body_radius_m
         # No command leads farther than this from where the robot is.
@@ -79,7 +85,7 @@ class ForeseenClearance:
             omega: its angular velocity now, rad/s.
 
         Returns:
-            float32 [38], the 19 within 0.42 s and the 19 within 1.4 s: log10(0.8 m / (distance - r)) of the smallest
+            float32 [44], the 22 within 0.42 s and the 22 within 1.4 s: log10(0.8 m / (distance - r)) of the smallest
             distance from the robot's centre, with r its inside, 0.2 m of the paper's robot; 0 where the distance is
             0.8 m more than that.
         """

@@ -52,7 +52,7 @@ REMEMBERED_MOVER_SIZE = 5
 """Numbers for each of them."""
 
 
-NUM_FORESEEN_COMMANDS = 19
+NUM_FORESEEN_COMMANDS = 22
 """Commands whose clearance is foreseen, for two horizons; see :mod:`rcdsac_trl.robot.foreseen_clearance`."""
 
 
@@ -71,7 +71,7 @@ def vector_observations(memory_s: float) -> dict[str, int]:
 
     Example:
         >>> vector_observations(0.0), vector_observations(12.0)["remembered"]
-        ({'waypoint': 6, 'velocity': 4}, 84)
+        ({'waypoint': 6, 'velocity': 4}, 90)
     """
     return VECTOR_OBSERVATIONS | ({"remembered": REMEMBERED_SIZE} if memory_s > 0.0 else {})
 

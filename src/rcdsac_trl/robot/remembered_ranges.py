@@ -55,7 +55,7 @@ class RememberedRanges:
         >>> ranges_m[0] = 0.48
         >>> told = remembered.observe(ranges_m, v=0.0, omega=0.0, elapsed_s=0.0)
         >>> told.shape, round(float(told[0]), 6)
-        ((84,), 1.0)
+        ((90,), 1.0)
     """
 
     def __init__(self, sensed: NDArray[np.bool_], memory_s: float, robot: RobotSettings = PAPER) -> None:
@@ -120,12 +120,12 @@ class RememberedRanges:
                 read either, so what is remembered there stays.
 
         Returns:
-            float32 [84]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
+            float32 [90]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
             degrees, counter-clockwise from straight ahead: log10((R - r) / (distance - r)) with the sensor's reach R
             and the inner radius r, 3 m and 0.2 m of the paper's robot; 0 where nothing is known within R.
             Then, for each of the two nearest things that move: its nearness, that times the cosine and the sine of its
             bearing, and its velocity ahead and to the left, m/s; zeros where there is none.
-            Last, for each of 19 commands, how near it would lead to all that soon, and then later; see
+            Last, for each of 22 commands, how near it would lead to all that soon, and then later; see
             :class:`~rcdsac_trl.robot.foreseen_clearance.ForeseenClearance`.
         """
         self._reckoning.move(v, omega, elapsed_s)

@@ -125,7 +125,8 @@ def _act(agents: "Agents", weights: "Weights") -> None:
     ranges, vectors, embedded, states, noise, loc, scale, action = agents
     num_range = weights.linear_bias.size
     features = np.empty(num_range + weights.vectors_bias.size, np.float32)
-    size = weights.head_bias.size
+    num_memory, size = weights.recurrent.shape[0], weights.head_bias.size
+    memory = np.empty(weights.head.shape[0], np.float32)
     head, gate, hidden = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     cosines = np.empty(weights.frequencies.size, np.float32)
     out = np.empty(weights.output_bias.size, np.float32)
@@ -134,7 +135,9 @@ def _act(agents: "Agents", weights: "Weights") -> None:
         _layer(vectors[agent], weights.vectors, weights.vectors_bias, features[num_range:])
         state = states[agent]
         _remember(features, state, weights)
-        _layer(state[: weights.recurrent.shape[0]], weights.head, weights.head_bias, head)
+        memory[:num_memory] = state[:num_memory]
+        memory[num_memory:] = vectors[agent, weights.foreseen_from : weights.foreseen_from + memory.size - num_memory]
+        _layer(memory, weights.head, weights.head_bias, head)
         if cosines.size > 0:
             for c in range(cosines.size):
                 cosines[c] = np.cos(embedded[agent] * weights.frequencies[c])
@@ -190,6 +193,7 @@ class Weights(NamedTuple):
     output: Floats
     output_bias: Floats
     restart_steps: int  # 0: the state never restarts
+    foreseen_from: int  # where in the vectors what the head reads besides the memory begins
 
 
 def _copied(encoder: Any, head: Any) -> Weights:
@@ -228,7 +232,7 @@ def _copied(encoder: Any, head: Any) -> Weights:
         "output_bias": head.output.bias,
     }
     arrays = {name: np.array(value.detach().numpy(), order="C") for name, value in tensors.items()}
-    return Weights(**arrays, restart_steps=encoder.restart_steps or 0)
+    return Weights(**arrays, restart_steps=encoder.restart_steps or 0, foreseen_from=encoder.foreseen_from)
 
 
 class CompiledActor:

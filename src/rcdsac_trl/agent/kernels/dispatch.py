@@ -20,9 +20,11 @@ from rcdsac_trl.agent.networks import (
     CosineFeatures,
     Encoder,
     HistoryEncoder,
+    LookAhead,
     QuantileHead,
     RangeFeatures,
     in_turn,
+    with_look_ahead,
 )
 from rcdsac_trl.robot.ring import KERNELS
 
@@ -51,7 +53,8 @@ def step(encoder: HistoryEncoder, range_: Tensor, *rest: Tensor) -> tuple[Tensor
     *vectors, is_init, state = rest
     lead = range_.shape[:-1]
     features = _features(encoder, [value.reshape(-1, value.shape[-1]) for value in (range_, *vectors)])
-    return encoder.advance(features.view(*lead, -1), is_init, state)
+    memory, after = encoder.advance(features.view(*lead, -1), is_init, state)
+    return encoder.with_foreseen(memory, vectors), after
 
 
 def has_compiled_actor(encoder: nn.Module, head: nn.Module) -> bool:
@@ -106,6 +109,7 @@ def _is_plain_quantile_head(module: nn.Module) -> bool:
     if type(module) is not QuantileHead or type(module.cosines) is not CosineFeatures:
         return False
     gated = module.measure is None or type(module.gate_beta) is nn.Linear
+    gated = gated and (module.look_ahead is None or type(module.look_ahead) is LookAhead)
     return gated and all(map(_is_linear, (module.input, module.gate_tau, module.hidden, module.output)))
 
 
@@ -119,7 +123,8 @@ def _encode(encoder: Any, *inputs: Any) -> Tensor:
     def run(part: Tensor) -> Tensor:
         return gated_recurrence(part.transpose(0, 1), encoder.gru).transpose(0, 1)
 
-    return in_turn(run, features.view(steps, sequences, -1).transpose(0, 1), encoder.restart_steps)
+    memory = in_turn(run, features.view(steps, sequences, -1).transpose(0, 1), encoder.restart_steps)
+    return encoder.with_foreseen(memory, inputs[1:])
 
 
 def _features(encoder: Any, rows: Sequence[Tensor]) -> Tensor:
@@ -135,4 +140,5 @@ def _evaluate(head: Any, memory: Any, action: Any, tau: Any, risk: Tensor | None
     layers = HeadLayers(
         head.input, head.gate_tau, None if head.measure is None else head.gate_beta, head.hidden, head.output
     )
-    return quantile_values(memory, action, tau, head.beta_cosines(risk), head.cosines.frequencies, layers)
+    told = with_look_ahead(head.look_ahead, memory, action)
+    return quantile_values(memory, told, tau, head.beta_cosines(risk), head.cosines.frequencies, layers)

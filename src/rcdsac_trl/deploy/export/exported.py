@@ -221,7 +221,7 @@ def _torch_runner(module: Callable[..., tuple[Tensor, Tensor]], names: tuple[str
 def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Runner]:
     config, mask = weights.config, weights.config.sensor_mask
     critic_encoders = [weights.part(f"critics.{number}.encoder") for number in range(config.num_critics)]
-    how = config.padding, config.range_code, config.restart_steps
+    how = config.padding, config.range_code, config.restart_steps, config.foreseen
     own, theirs = Encoders([weights.part("actor.encoder")], mask, *how), Encoders(critic_encoders, mask, *how)
     actor, critics = Actor(weights), Critics(weights, fractions)
 
@@ -236,12 +236,11 @@ def _numpy_runners(weights: Weights, fractions: NDArray[np.float32]) -> list[Run
     def act(inputs: dict[str, Array]) -> tuple[Array, Array]:
         vectors, embedded = told(inputs)
         state = own.step(inputs["range"][0], vectors, inputs["memory"])
-        return actor.action(state[0, : own.memory_size], embedded)[None], state
+        return actor.action(own.heads_read(state, vectors)[0], embedded)[None], state
 
     def judge(inputs: dict[str, Array]) -> tuple[Array, Array]:
         vectors, embedded = told(inputs)
         states = theirs.step(inputs["range"][0], vectors, inputs["memories"][:, 0])
-        memories = states[:, : theirs.memory_size]
-        return critics.values(memories, inputs["action"][0], embedded)[None], states[:, None]
+        return critics.values(theirs.heads_read(states, vectors), inputs["action"][0], embedded)[None], states[:, None]
 
     return [act, judge]

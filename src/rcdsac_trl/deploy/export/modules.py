@@ -6,6 +6,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
+from rcdsac_trl.agent.actor import network_of_heads
 from rcdsac_trl.agent.networks import ActorHead, Encoder, HistoryEncoder, NetworkSettings, QuantileHead, ScalarHead
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights
@@ -30,7 +31,8 @@ class ActorStep(nn.Module):
     def of_weights(cls, weights: Weights) -> Self:
         """Make the step of an agent's actor."""
         config, network = weights.config, network_of(weights.config)
-        encoder, head = Encoder(config.vectors, network), ActorHead(ACTION_SIZE, network, measure_of(config))
+        encoder = Encoder(config.vectors, network)
+        head = ActorHead(ACTION_SIZE, network_of_heads(network), measure_of(config))
         _load(encoder, weights, "actor.encoder")
         _load(head, weights, "actor.head")
         return cls(encoder, head, weighted=config.context == "collision_weight")
@@ -52,7 +54,7 @@ class ActorStep(nn.Module):
             velocity: [B, 4].
             context: ``beta`` or the collision weight, [B, 1]; not read by an agent that is told neither.
             memory: the state, [B, state]; zeros at the start.
-            remembered: [B, 84], of an agent that is told what it saw.
+            remembered: [B, 90], of an agent that is told what it saw.
         """
         vectors = (waypoint, velocity, remembered, context if self.weighted else None)
         read, after = _encode(self.encoder, range_, vectors, memory)
@@ -75,7 +77,7 @@ class CriticStep(nn.Module):
         config, network = weights.config, network_of(weights.config)
         numbers = range(config.num_critics)
         self.encoders = nn.ModuleList(Encoder(config.vectors, network) for _ in numbers)
-        self.heads = nn.ModuleList(_critic_head(config, network) for _ in numbers)
+        self.heads = nn.ModuleList(_critic_head(config, network_of_heads(network)) for _ in numbers)
         self.weighted = config.context == "collision_weight"
         self.register_buffer("fractions", fractions.reshape(1, 1, -1))
         for number in numbers:
@@ -129,6 +131,7 @@ def network_of(config: AgentConfig) -> NetworkSettings:
         padding=config.padding,
         range_code=config.range_code,
         restart_steps=config.restart_steps,
+        look_ahead=config.look_ahead,
         **config.network,  # type: ignore[arg-type]
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.weights import Weights
+from rcdsac_trl.robot.look_ahead import look_ahead
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.ring import RING_ENDS, Padding
@@ -39,6 +40,7 @@ class Encoders:
         padding: how the convolutions read the ring of bins; see :mod:`rcdsac_trl.robot.ring`.
         range_code: how they read a bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
         restart_steps: a state restarts every so many observations; None: never.
+        foreseen: where in the vector observations the foreseen clearances stand, which heads read; None: they do not.
 
     Attributes:
         number: of encoders, E.
@@ -53,7 +55,9 @@ class Encoders:
         padding: Padding,
         range_code: RangeCode,
         restart_steps: int | None = None,
+        foreseen: slice | None = None,
     ) -> None:
+        self._foreseen = foreseen
         self._reads_nearness = range_code == "nearness"
         self._restart_steps = restart_steps
         self.number, self.memory_size = len(parts), parts[0]["gru.weight_hh_l0"].shape[1]
@@ -117,6 +121,14 @@ class Encoders:
         after[:, -1] = age + 1
         return after
 
+    def heads_read(self, states: Array, vectors: Array) -> Array:
+        """Return what each encoder's head reads, [E, n], of the states after an observation and its vectors."""
+        memories = states[:, : self.memory_size]
+        if self._foreseen is None:
+            return memories
+        foreseen = vectors[self._foreseen]
+        return np.concatenate((memories, np.broadcast_to(foreseen, (self.number, len(foreseen)))), axis=1)
+
     def _positions(self, bins: Array) -> Array:
         """Return what both convolutions make of the bins at the live positions, [E, positions, channels]."""
         (weight_1, bias_1), (weight_2, bias_2) = self._convolutions
@@ -152,7 +164,7 @@ class Encoders:
 
 
 class Actor:
-    """A memory to an action; see ``rcdsac_trl.agent.networks.ActorHead``."""
+    """What its encoder hands on to an action; see ``rcdsac_trl.agent.networks.ActorHead``."""
 
     def __init__(self, weights: Weights) -> None:
         parts = [weights.part("actor.head")]
@@ -160,14 +172,14 @@ class Actor:
         self._input, self._hidden, self._output = (_linear(parts, name) for name in ("input", "hidden", "output"))
         self._gate = _linear(parts, "gate") if "gate.weight" in parts[0] else None
 
-    def action(self, memory: Array, embedded: float | None) -> Array:
+    def action(self, read: Array, embedded: float | None) -> Array:
         """Return the deterministic action tanh(mean), [2].
 
         Args:
-            memory: [memory].
+            read: [n], see :meth:`Encoders.heads_read`.
             embedded: ``beta`` in [0, 1]; None where the networks read none.
         """
-        x = _rectified(memory[None], self._input)
+        x = _rectified(read[None], self._input)
         if self._gate is not None and embedded is not None:
             x *= _rectified(_cosines(embedded, self._angles), self._gate)
         weight, bias = self._output
@@ -176,7 +188,7 @@ class Actor:
 
 
 class Critics:
-    """Memories and an action to quantiles of the return, or to its mean: of all critics' the lower ones.
+    """What their encoders hand on and an action to quantiles of the return, or its mean: of all critics' the lower.
 
     Args:
         weights: of the agent.
@@ -185,6 +197,7 @@ class Critics:
 
     def __init__(self, weights: Weights, fractions: Array) -> None:
         parts = [weights.part(f"critics.{number}.head") for number in range(weights.config.num_critics)]
+        self._looks_ahead = weights.config.look_ahead
         self._angles = _angles(weights)
         self._input, self._hidden, self._output = (_linear(parts, name) for name in ("input", "hidden", "output"))
         told = "gate_beta.weight" in parts[0]
@@ -195,20 +208,21 @@ class Critics:
             weight, bias = _linear(parts, "gate_tau")
             self._gate = np.concatenate([_cosines(float(tau), self._angles) for tau in fractions]) @ weight + bias
 
-    def values(self, memories: Array, action: Array, embedded: float | None) -> Array:
+    def values(self, read: Array, action: Array, embedded: float | None) -> Array:
         """Return the lower of the critics' quantiles each, [N], or of scalar critics' means, [1].
 
         Quantiles rise: those of each critic are rearranged (Chernozhukov, Fernandez-Val and Galichon 2010).
 
         Args:
-            memories: of each critic, [C, memory].
+            read: of each critic, [C, n], see :meth:`Encoders.heads_read`.
             action: u, [2].
             embedded: ``beta`` in [0, 1]; None where the networks read none.
         """
-        size = memories.shape[1]
-        read = np.empty((len(memories), 1, size + len(action)), dtype=np.float32)
-        read[:, 0, :size], read[:, 0, size:] = memories, action
-        x = _rectified(read, self._input)
+        told = np.concatenate((action, look_ahead(read[0], action))) if self._looks_ahead else action
+        size = read.shape[1]
+        joined = np.empty((len(read), 1, size + len(told)), dtype=np.float32)
+        joined[:, 0, :size], joined[:, 0, size:] = read, told
+        x = _rectified(joined, self._input)
         if self._gate is not None:
             gate = self._gate
             if self._beta is not None and embedded is not None:

@@ -125,11 +125,13 @@ class Policy:
             self.config.padding,
             self.config.range_code,
             self.config.restart_steps,
+            self.config.foreseen,
         )
         self._actor = Actor(weights)
         self._critics = Critics(weights, self.fractions)
         self._halted = False
         self._states: Array
+        self._read: Array
         self._steps: int
         self._commanded: tuple[float, float]
         self.reset()
@@ -294,7 +296,9 @@ class Policy:
             vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
         if config.context == "collision_weight" and context is not None:
             vectors.append(context)
-        self._states = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._states)
+        told = np.array(vectors, dtype=np.float32)
+        self._states = self._encoders.step(bins, told, self._states)
+        self._read = self._encoders.heads_read(self._states, told)
         self._steps += 1
         outlook = self._outlook(self._embedded(context))
         self._wanted = outlook.wanted
@@ -307,10 +311,9 @@ class Policy:
         return self.config.embedding[0] * context + self.config.embedding[1]
 
     def _outlook(self, embedded: float | None, action: Array | None = None) -> Outlook:
-        memories = self._states[:, : self._encoders.memory_size]
         if action is None:
-            action = self._actor.action(memories[0], embedded)
-        lower = self._critics.values(memories[1:], action, embedded)
+            action = self._actor.action(self._read[0], embedded)
+        lower = self._critics.values(self._read[1:], action, embedded)
         quantiles = lower if self.config.critic == "quantile" else None
         told = lower.tolist()  # of so few, Python's sum is the fastest mean
         return Outlook(action, desired_velocities(action.tolist(), self.robot), quantiles, sum(told) / len(told))

@@ -22,6 +22,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, NUM_LOOK_AHEAD
 from rcdsac_trl.robot.observation import RangeCode, vector_observations
 from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS, check_memory
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
@@ -29,10 +30,11 @@ from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
 FORMAT_VERSION = 4
 """What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
+_UNSAID_BY_3: dict[str, Any] = {"restart_steps": None, "look_ahead": False, "robot": PAPER}
 _UNSAID: dict[int, dict[str, Any]] = {
-    1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", "restart_steps": None, "robot": PAPER},
-    2: {"memory_s": 0.0, "range_code": "paper", "restart_steps": None, "robot": PAPER},
-    3: {"restart_steps": None, "robot": PAPER},
+    1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
+    2: {"memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
+    3: _UNSAID_BY_3,
     FORMAT_VERSION: {},
 }
 CONFIG_NAME = "config.json"
@@ -74,6 +76,8 @@ class AgentConfig:
         range_code: how its convolutions read a range bin; see :data:`rcdsac_trl.robot.observation.RangeCode`.
         restart_steps: its recurrent states restart every so many observations; None: never. See
             :class:`~rcdsac_trl.deploy.policy.inference.Encoders`.
+        look_ahead: its heads read the foreseen clearances, and critics those of their action; see
+            :mod:`rcdsac_trl.robot.look_ahead`.
         robot: that it was trained to drive; plain values of one, as files have them, are read.
 
     Raises:
@@ -98,6 +102,7 @@ class AgentConfig:
     memory_s: float = 0.0
     range_code: RangeCode = "paper"
     restart_steps: int | None = None
+    look_ahead: bool = False
     robot: RobotSettings = PAPER
 
     def __post_init__(self) -> None:
@@ -129,6 +134,11 @@ class AgentConfig:
             raise UserInputError(f"range_code={self.range_code!r} is none of {', '.join(get_args(RangeCode))}")
         if self.restart_steps is not None and (type(self.restart_steps) is not int or self.restart_steps < 1):
             raise UserInputError(f"restart_steps={self.restart_steps} is neither a number of steps nor null")
+        if type(self.look_ahead) is not bool or (self.look_ahead and self.memory_s == 0.0):
+            raise UserInputError(
+                f"look_ahead={self.look_ahead} with memory_s={self.memory_s:g}: it is true or false, and an agent "
+                "without a memory foresees nothing"
+            )
         if self.critic not in ("quantile", "scalar"):
             raise UserInputError(f"critic={self.critic!r} is neither 'quantile' nor 'scalar'")
         if set(self.network) != set(_WIDTHS) or not all(type(w) is int and w >= 1 for w in self.network.values()):
@@ -153,6 +163,14 @@ class AgentConfig:
         weighted = self.context == "collision_weight"
         return vector_observations(self.memory_s) | ({"collision_weight": 1} if weighted else {})
 
+    @property
+    def foreseen(self) -> slice | None:
+        """Where in all vector observations the foreseen clearances stand that its heads read; None: they do not."""
+        if not self.look_ahead:
+            return None
+        end = sum(vector_observations(self.memory_s).values())
+        return slice(end - FORESEEN_SIZE, end)
+
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of every tensor of the agent, by name."""
         parts = {"actor.encoder": self._encoder(), "actor.head": self._actor_head()}
@@ -176,11 +194,15 @@ class AgentConfig:
             shapes |= {f"gru.weight_{side}_l0": (3 * n["memory"], size), f"gru.bias_{side}_l0": (3 * n["memory"],)}
         return shapes
 
+    def _read(self) -> int:
+        """Return how many numbers of the encoder's a head reads."""
+        return self.network["memory"] + (FORESEEN_SIZE if self.look_ahead else 0)
+
     def _actor_head(self) -> dict[str, tuple[int, ...]]:
         n = self.network
         gate = _linear("gate", n["cosines"], n["head"]) if self.context == "beta" else {}
         return (
-            _linear("input", n["memory"], n["head"])
+            _linear("input", self._read(), n["head"])
             | gate
             | _linear("hidden", n["head"], n["head"])
             | _linear("output", n["head"], 2 * _ACTION_SIZE)
@@ -188,7 +210,8 @@ class AgentConfig:
 
     def _critic_head(self) -> dict[str, tuple[int, ...]]:
         n = self.network
-        shapes = _linear("input", n["memory"] + _ACTION_SIZE, n["head"])
+        told = _ACTION_SIZE + (NUM_LOOK_AHEAD if self.look_ahead else 0)
+        shapes = _linear("input", self._read() + told, n["head"])
         if self.critic == "quantile":
             shapes |= _linear("gate_tau", n["cosines"], n["head"])
             if self.context == "beta":

@@ -33,7 +33,7 @@ class NavigationEnv(OfOneProcess, EnvBase):
     reset of an agent begins its next episode. Whatever process holds an agent, and whatever the others do, its
     starts and goals are the same, and the same actions give bit-identical results.
 
-    Observations: ``range`` [180], ``waypoint`` [6], ``velocity`` [4], with ``memory_s`` above 0 ``remembered`` [84],
+    Observations: ``range`` [180], ``waypoint`` [6], ``velocity`` [4], with ``memory_s`` above 0 ``remembered`` [90],
     and for metrics and drawing only ``pose`` [3] (x, y in m, yaw in rad, map frame), ``contact`` [1],
     ``goal_reached`` [1] and ``reward_components`` [5].
 

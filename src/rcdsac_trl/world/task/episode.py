@@ -83,7 +83,7 @@ class NavigationAgent:
         reward_components: of the last step, see :func:`~rcdsac_trl.world.task.rules.reward_components`; zeros after
             a reset.
         distances_m: what the range sensor measures, float64 [180], m.
-        remembered: what it remembers, float32 [84], see
+        remembered: what it remembers, float32 [90], see
             :class:`~rcdsac_trl.robot.remembered_ranges.RememberedRanges`; None without a memory.
     """
 

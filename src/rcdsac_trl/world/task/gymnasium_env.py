@@ -23,7 +23,7 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
     """One agent of :class:`~rcdsac_trl.world.task.env.NavigationEnv`, with the same episodes and numbers.
 
     Observations: a dict of ``range`` [180], ``waypoint`` [6], ``velocity`` [4] and, with ``memory_s`` above 0,
-    ``remembered`` [84], float32.
+    ``remembered`` [90], float32.
 
     Info: ``pose`` [3] (x, y in m, yaw in rad), ``contact``, ``goal_reached``, ``reward_components`` [5], and the
     ``seed`` and ``episode`` that map, start, goals and movers derive from.

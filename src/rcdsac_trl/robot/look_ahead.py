@@ -1,0 +1,68 @@
+"""What foreseen clearances say of one action: interpolated over the actions that they were computed for.
+
+A critic that is told how near *this* action leads need not learn to look it up, and its slope along the action says
+which way there is more room. Between the actions of :data:`~rcdsac_trl.robot.foreseen_clearance.FORESEEN_ACTIONS` it is
+linear along both axes: over the turns of a row, then from row to row.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.robot.foreseen_clearance import FORESEEN_ACTIONS
+from rcdsac_trl.robot.observation import NUM_FORESEEN_COMMANDS
+
+NUM_LOOK_AHEAD = 2
+"""Numbers that are told of an action: how near it leads soon, and later."""
+
+FORESEEN_SIZE = NUM_LOOK_AHEAD * NUM_FORESEEN_COMMANDS
+"""Numbers they are interpolated from: the last of what is remembered."""
+
+
+def _lines(grid: tuple[float, ...]) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Return slope and offset of the line that rises to each place of a grid, and of the one that falls behind it.
+
+    A line is 1 at its place and 0 at the neighbour; at the ends of the grid it stays 1.
+    """
+    rising = [(0.0, 1.0), *((1.0 / (b - a), -a / (b - a)) for a, b in pairwise(grid))]
+    falling = [*((-1.0 / (b - a), b / (b - a)) for a, b in pairwise(grid)), (0.0, 1.0)]
+    return list(zip(rising, falling, strict=True))
+
+
+def _hats() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    rows = [speed for speed, _ in FORESEEN_ACTIONS]
+    of_row = dict(zip(sorted(rows), _lines(tuple(sorted(rows))), strict=True))
+    lines = [(of_row[speed], line) for speed, turns in FORESEEN_ACTIONS for line in _lines(turns)]
+    # [action, axis, side, slope or offset] to [slope or offset, side, axis, action]
+    slopes, offsets = np.array(lines, np.float32).transpose(3, 2, 1, 0)
+    return np.ascontiguousarray(slopes), np.ascontiguousarray(offsets)
+
+
+HAT_SLOPES, HAT_OFFSETS = _hats()
+"""Both sides of every action's hat function, float32 [2, 2, 22]: the rising and the falling one, along the action's
+first and second number. A hat is the smaller of both sides, within [0, 1]; an action's weight is the product of its
+two hats, and all weights add up to 1."""
+
+
+def look_ahead(foreseen: NDArray[np.float32], action: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return how near an action leads, in the numbers of what is foreseen.
+
+    Args:
+        foreseen: [n >= 44], last of it what is foreseen; see
+            :meth:`~rcdsac_trl.robot.foreseen_clearance.ForeseenClearance.nearness`.
+        action: u, [2], in [-1, 1].
+
+    Returns:
+        float32 [2]: soon, and later.
+
+    Example:
+        >>> foreseen = np.zeros(44, np.float32)
+        >>> foreseen[[4, 22 + 4]] = 0.5, 1.0  # straight ahead at full speed
+        >>> look_ahead(foreseen, np.array([1.0, 0.125], np.float32)).tolist()  # half of it, half of what lies beside
+        [0.25, 0.5]
+    """
+    rising, falling = HAT_SLOPES * action[:, None] + HAT_OFFSETS
+    first, second = np.minimum(rising, falling).clip(0.0, 1.0)
+    told: NDArray[np.float32] = foreseen[-FORESEEN_SIZE:].reshape(NUM_LOOK_AHEAD, -1) @ (first * second)
+    return told
