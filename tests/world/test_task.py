@@ -244,6 +244,7 @@ def test_default_settings_are_the_papers():
     assert settings.collision_penalty_mode == "onset"
     noise = (settings.range_noise_std_m, settings.range_dropout, *settings.odometry_noise_std)
     assert (*noise, settings.action_delay_steps) == (0.0, 0.0, 0.0, 0.0, 0)
+    assert (settings.pose_noise_std, settings.motor_slowness, settings.disturbances) == ((0.0, 0.0), 0.0, "fixed")
 
 
 def test_settings_turn_lists_into_tuples():
@@ -271,6 +272,10 @@ def test_settings_turn_lists_into_tuples():
         ("odometry_noise_std", (0.1,)),
         ("odometry_noise_std", (0.1, -0.1)),
         ("action_delay_steps", -1),
+        ("pose_noise_std", (0.1,)),
+        ("pose_noise_std", (0.1, -0.1)),
+        ("motor_slowness", 1.0),
+        ("disturbances", "random"),
     ],
 )
 def test_settings_outside_their_limits_are_refused(name, value):

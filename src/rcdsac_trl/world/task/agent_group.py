@@ -186,7 +186,7 @@ class AgentGroup(OfOneProcess):
         numbers = np.array(
             [
                 (
-                    *waypoint_observation(agent.pose, *agent.next_waypoints),
+                    *waypoint_observation(agent.believed_pose, *agent.next_waypoints),
                     *agent.velocities,
                     *agent.pose,
                     *agent.reward_components,

@@ -26,6 +26,7 @@ from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.render import Scene
 from rcdsac_trl.world.sim.simulation import Simulation
 from rcdsac_trl.world.task import rules
+from rcdsac_trl.world.task.disturbances import PoseError, draw_disturbances
 from rcdsac_trl.world.task.rules import TaskSettings
 
 Pose = tuple[float, float, float]
@@ -129,7 +130,9 @@ class NavigationAgent:
             self._simulation = Simulation(gui=self._gui, robot=self._robot)
         self._simulation.load(self._map, self._planner, self.pose, self._stream("movers"))
         self._noise = self._stream("noise")
-        self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._task.action_delay_steps)
+        self._disturbances = draw_disturbances(self._task, self._stream("disturbances"))
+        self._pose_error = PoseError(self._disturbances.pose_noise_std, self._stream("pose_error"))
+        self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._disturbances.action_delay_steps)
         self._goals_drawn = 0
         self._goal = x, y
         self._draw_goal()
@@ -143,10 +146,12 @@ class NavigationAgent:
 
     def step(self, action: Sequence[float]) -> None:
         """Take one agent step."""
-        simulation, task = self.simulation, self._task
+        simulation, task, disturbances = self.simulation, self._task, self._disturbances
         v_u, omega_u = desired_velocities(action, self._robot)
         self._delayed.append((v_u, omega_u))
-        moved = simulation.step(*self._delayed.popleft(), self._motor_steps)
+        v, omega = self._delayed.popleft()
+        reached = 1.0 - disturbances.motor_slowness
+        moved = simulation.step(reached * v, reached * omega, self._motor_steps)
         collided = rules.collision_due(moved.in_contact, self.in_contact, task.collision_penalty_mode)
         self.in_contact = moved.in_contact
         self.pose = moved.pose
@@ -160,7 +165,7 @@ class NavigationAgent:
             self._draw_goal()
         else:
             self._take_waypoints()
-        v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, task.odometry_noise_std, self._noise)
+        v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, disturbances.odometry_noise_std, self._noise)
         self.velocities = (v_c, omega_c, v_u, omega_u)
         self._sense(elapsed_s=self._motor_steps * self._robot.motor_period_s)
 
@@ -168,6 +173,11 @@ class NavigationAgent:
     def next_waypoints(self) -> tuple[Point, Point]:
         """The next waypoint and the one after it, m; on the last leg both are the goal."""
         return self._path[self._next], self._path[min(self._next + 1, len(self._path) - 1)]
+
+    @property
+    def believed_pose(self) -> Pose:
+        """Where its localisation says that it is; what it is told of waypoints is told from there."""
+        return self._pose_error.added_to(self.pose)
 
     @property
     def simulation(self) -> Simulation:
@@ -248,9 +258,10 @@ class NavigationAgent:
 
     def _sense(self, elapsed_s: float) -> None:
         self._trail.append(self.pose[:2])
-        task = self._task
+        noise = self._disturbances
         distances = self.simulation.scan()
-        self.distances_m = rules.noisy_ranges(distances, task.range_noise_std_m, task.range_dropout, self._noise)
+        self.distances_m = rules.noisy_ranges(distances, noise.range_noise_std_m, noise.range_dropout, self._noise)
+        self._pose_error.step(elapsed_s)
         v_c, omega_c, _, _ = self.velocities
         memory = self._memory
         self.remembered = None if memory is None else memory.observe(self.distances_m, v_c, omega_c, elapsed_s)

@@ -59,6 +59,11 @@ class TaskSettings:
         range_dropout: probability that a range is lost (reads as "nothing there"), per bin and step.
         odometry_noise_std: standard deviations of the noise on the measured velocities, (m/s, rad/s).
         action_delay_steps: agent steps an action waits before it acts.
+        pose_noise_std: standard deviations of the error of the pose that waypoints are told from, (m, rad); see
+            :class:`~rcdsac_trl.world.task.disturbances.PoseError`.
+        motor_slowness: share by which the robot drives and turns slower than it is told.
+        disturbances: ``"fixed"``: noise, delay and slowness are what they say in every episode; ``"drawn"``: at most,
+            every episode draws a share of each.
 
     Raises:
         UserInputError: a value is outside its limits.
@@ -79,15 +84,19 @@ class TaskSettings:
     range_dropout: float = 0.0
     odometry_noise_std: tuple[float, float] = (0.0, 0.0)
     action_delay_steps: int = 0
+    pose_noise_std: tuple[float, float] = (0.0, 0.0)
+    motor_slowness: float = 0.0
+    disturbances: Literal["fixed", "drawn"] = "fixed"
 
     def __post_init__(self) -> None:
         """Refuse what is outside the limits."""
-        for name in ("motor_steps", "odometry_noise_std"):
+        for name in ("motor_steps", "odometry_noise_std", "pose_noise_std"):
             if not isinstance(getattr(self, name), Sequence):
                 raise UserInputError(f"{name}={getattr(self, name)} must be a list of numbers, such as [6, 7, 8]")
         # Hydra hands lists over; a frozen value keeps tuples.
         object.__setattr__(self, "motor_steps", tuple(self.motor_steps))
         object.__setattr__(self, "odometry_noise_std", tuple(self.odometry_noise_std))
+        object.__setattr__(self, "pose_noise_std", tuple(self.pose_noise_std))
         if self.version != RULES_VERSION:
             raise UserInputError(
                 f"task version is {self.version!r} but this is version {RULES_VERSION} of the rules; "
@@ -111,10 +120,14 @@ class TaskSettings:
             raise UserInputError(f"range_noise_std_m={self.range_noise_std_m} must be 0 or more")
         if not 0.0 <= self.range_dropout <= 1.0:
             raise UserInputError(f"range_dropout={self.range_dropout} is a probability; give 0 to 1")
-        if len(self.odometry_noise_std) != 2 or not all(0.0 <= s < math.inf for s in self.odometry_noise_std):
-            raise UserInputError(
-                f"odometry_noise_std={list(self.odometry_noise_std)} must be two numbers of 0 or more: m/s and rad/s"
-            )
+        for name, units in (("odometry_noise_std", "m/s and rad/s"), ("pose_noise_std", "m and rad")):
+            pair = getattr(self, name)
+            if len(pair) != 2 or not all(0.0 <= s < math.inf for s in pair):
+                raise UserInputError(f"{name}={list(pair)} must be two numbers of 0 or more: {units}")
+        if not 0.0 <= self.motor_slowness < 1.0:
+            raise UserInputError(f"motor_slowness={self.motor_slowness} is a share of the speed: give 0 to below 1")
+        if self.disturbances not in ("fixed", "drawn"):
+            raise UserInputError(f"disturbances={self.disturbances!r} does not exist: choose fixed or drawn")
         if self.action_delay_steps < 0:
             raise UserInputError(f"action_delay_steps={self.action_delay_steps} must be 0 or more")
 
