@@ -15,6 +15,7 @@ from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.world.maps.files.barn import GOAL_RADIUS_M, TIME_LIMIT_S, BarnMapSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.maps.map_mixture import MapMixture
 from rcdsac_trl.world.maps.map_source import MapSource
 from rcdsac_trl.world.task.rules import TaskSettings
 
@@ -187,7 +188,7 @@ class EvaluationSettings:
 def _changed_maps(trained: MapSource, values: Mapping[str, Any] | None) -> MapSource | BarnMapSettings:
     if not values:
         return trained
-    chosen = section_class((type(trained), MapSettings, FileMapSettings, BarnMapSettings), values)
+    chosen = section_class((type(trained), MapSettings, FileMapSettings, BarnMapSettings, MapMixture), values)
     if chosen is not type(trained):  # a training's keys say nothing of maps of another kind
         return read(chosen, values, "map")
     if "path" in values:  # of other files nothing was noted

@@ -22,6 +22,11 @@ _GROUPED = 0.35  # probability that a piece stands with others
 _GROUP_M = 0.9  # standard deviation of how far from them
 # Shelf, crate, post, barrel: what is mapped is rather furniture, what is not rather stands about.
 _WEIGHTS = {True: (0.3, 0.35, 0.15, 0.2), False: (0.1, 0.4, 0.25, 0.25)}
+# Furniture: how many of it are tables, their sides and those of chairs from smallest to largest, and legs.
+_TABLES = 0.4
+_TABLE_M = ((0.8, 0.6), (1.6, 0.8))
+_CHAIR_M = ((0.38, 0.38), (0.5, 0.5))
+_LEG_RADIUS_M = (0.015, 0.03)
 
 Piece = Box | Cylinder
 
@@ -74,6 +79,31 @@ class ClutterSite:
             for _ in range(_TRIES):
                 if self._put(self._draw(mapped, rng)):
                     break
+
+    def furnish(self, count: int, rng: np.random.Generator) -> None:
+        """Put up to ``count`` tables and chairs in, each on four legs that the planner does not know."""
+        for _ in range(count):
+            for _ in range(_TRIES):
+                if self._put_all(self._drawn_legs(rng)):
+                    break
+
+    def _drawn_legs(self, rng: np.random.Generator) -> list[Piece]:
+        x, y = self._anywhere(rng)
+        is_table = rng.random() < _TABLES
+        size = rng.uniform(*(_TABLE_M if is_table else _CHAIR_M))
+        yaw, radius = float(rng.uniform(0.0, math.pi)), float(rng.uniform(*_LEG_RADIUS_M))
+        half_x, half_y = (size / 2.0 - radius).tolist()
+        corners = Box(x, y, half_x, half_y, yaw, mapped=False).corners()
+        return [Cylinder(leg_x, leg_y, radius, False) for leg_x, leg_y in corners.tolist()]
+
+    def _put_all(self, pieces: Sequence[Piece]) -> bool:
+        """Put all of some pieces in, or none."""
+        before = self._field, self._boxes, self._circles, len(self.pieces)
+        if all(self._put(piece) for piece in pieces):
+            return True
+        self._field, self._boxes, self._circles, number = before
+        del self.pieces[number:]
+        return False
 
     def _put(self, piece: Piece) -> bool:
         """Put a piece in unless it overlaps something or cuts the free space."""

@@ -56,6 +56,8 @@ class MapSettings:
             they lead around corners.
         detour_m: how far around the places that an unmapped piece takes a way past it may lead, m; the less,
             the shorter the detours.
+        yielding_fraction: share of the movers that stop for a robot in their way, in [0, 1].
+        furniture_per_m2: tables and chairs per square metre, thin legs all of them; the planner knows none.
 
     Raises:
         UserInputError: a value is outside its limits.
@@ -74,6 +76,8 @@ class MapSettings:
     clearance_margin_m: float = CLEARANCE_MARGIN_M
     waypoint_clearance_m: float = WAYPOINT_CLEARANCE_M
     detour_m: float = 0.5
+    yielding_fraction: float = 1.0
+    furniture_per_m2: float = 0.0
 
     def __post_init__(self) -> None:
         """Turn the lists of a YAML file into tuples and refuse what no map can be made from."""
@@ -94,6 +98,7 @@ class MapSettings:
         check_number("size_m", self.size_m, 10.0, 60.0)
         check_number("clutter_per_m2", self.clutter_per_m2, 0.0, 1.0)
         check_number("mapped_fraction", self.mapped_fraction, 0.0, 1.0)
+        check_number("furniture_per_m2", self.furniture_per_m2, 0.0, 0.5)
         passage_m = _passage_m(ROBOT_RADIUS_M, self.clearance_margin_m)
         check_range("corridor_width_m", self.corridor_width_m, passage_m, 5.0)
         check_range("door_width_m", self.door_width_m, passage_m, 2.0)
@@ -160,6 +165,7 @@ def generate_map(
     num_mapped = round(count * settings.mapped_fraction)
     site.fill(num_mapped, True, rng)
     site.fill(count - num_mapped, False, rng)
+    site.furnish(round(settings.furniture_per_m2 * settings.size_m**2), rng)
     movers = draw_movers(settings, rng)
     return Map(
         layout=layout,

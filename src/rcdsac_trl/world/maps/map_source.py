@@ -1,4 +1,4 @@
-"""Where maps come from: the generator or files, behind one function."""
+"""Where maps come from: the generator, several settings of it, or files, behind one function."""
 
 from dataclasses import replace
 
@@ -6,9 +6,10 @@ from rcdsac_trl.world.maps.files.file_map import FileMapSettings, check_file_map
 from rcdsac_trl.world.maps.files.map_files import digests, map_files
 from rcdsac_trl.world.maps.generator import MapSettings, Split, generate_map
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
+from rcdsac_trl.world.maps.map_mixture import MapMixture
 from rcdsac_trl.world.maps.shapes import Map
 
-MapSource = MapSettings | FileMapSettings
+MapSource = MapSettings | FileMapSettings | MapMixture
 """Settings that maps are made from."""
 
 
@@ -28,7 +29,14 @@ def make_map(source: MapSource, split: Split, seed: int, index: int, robot_radiu
     """
     if isinstance(source, FileMapSettings):
         return file_map(source, split, seed, index, robot_radius_m)
+    if isinstance(source, MapMixture):
+        source = source.families[source.family_of(split, seed, index)]
     return generate_map(source, split, seed, index, robot_radius_m)
+
+
+def sources_of(source: MapSource) -> list[MapSettings | FileMapSettings]:
+    """List the settings that maps are made from; of a mixture, those of all its sets."""
+    return list(source.families.values()) if isinstance(source, MapMixture) else [source]
 
 
 def with_digests(source: MapSource) -> MapSource:

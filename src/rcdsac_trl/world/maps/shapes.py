@@ -83,10 +83,17 @@ def solid_arrays(pieces: Sequence[Box | Cylinder]) -> tuple[NDArray[np.float64],
 
 @dataclass(frozen=True)
 class Mover:
-    """A walking cylinder: radius in m, top speed in m/s. Where it walks is drawn per simulation."""
+    """A walking cylinder. Where it walks is drawn per simulation.
+
+    Attributes:
+        radius: m.
+        speed_m_per_s: top speed.
+        yields: whether it stops for a robot in its way; one that does not stops when they touch.
+    """
 
     radius: float
     speed_m_per_s: float
+    yields: bool = True
 
 
 def _sides(boxes: Sequence[Box]) -> NDArray[np.float64]:
@@ -193,6 +200,9 @@ class Map:
         for name in ("start", "goal"):  # as maps without them always were
             if values[name] is None:
                 del values[name]
+        for mover in values["movers"]:
+            if mover["yields"]:
+                del mover["yields"]
         return json.dumps({"format": FORMAT_VERSION, **values})
 
     @classmethod
@@ -265,7 +275,7 @@ def _check_read(map_: Map) -> None:
     ]
     for where, part in parts:
         for name, value in vars(part).items():
-            if name in ("mapped", "wall"):
+            if name in ("mapped", "wall", "yields"):
                 if not isinstance(value, bool):
                     raise ValueError(f"{name} in {where} is {value!r}, neither true nor false")
             elif isinstance(part, Mover):

@@ -4,7 +4,8 @@ A mover is kinematic: nothing pushes it, it decides where it is. Its tour goes t
 places and back to the first, along the planner's paths with rounded corners, so it never leaves the clearance
 that was planned for it by more than :data:`CORNER_CUT_M`. Along the tour it accelerates and brakes within
 bounds, slows down for bends, stops for the robot or another mover right in front of it, and turns back when
-that does not go away. Only when the robot runs into its front does it stop at once.
+that does not go away. Only when the robot runs into its front does it stop at once; a mover that does not yield stops
+for the robot then alone.
 """
 
 import math
@@ -26,6 +27,7 @@ from rcdsac_trl.world.sim.walk import (
     SPEED2,
     START,
     TOP_SPEED,
+    YIELDS,
     notice_gap,
     point_on,
     walk,
@@ -84,9 +86,10 @@ class Movers:
         count = len(map.movers)
         self.discs = np.zeros((count, 3))
         self.discs[:, 2] = [mover.radius for mover in map.movers]
-        self._walks = np.zeros((count, 7))
+        self._walks = np.zeros((count, 8))
         self._walks[:, DIRECTION] = 1.0
         self._walks[:, TOP_SPEED] = [mover.speed_m_per_s for mover in map.movers]
+        self._walks[:, YIELDS] = [mover.yields for mover in map.movers]
         self._period_s = period_s
         self.fastest_m_per_s = float(self._walks[:, TOP_SPEED].max(initial=0.0))
         self.notice_gap_m = notice_gap(self.fastest_m_per_s, period_s)

@@ -23,7 +23,7 @@ _SIDE_GAP_M = 0.05
 # Columns of a tour: one row is one piece, a straight line or an arc.
 START, END, X, Y, HEADING, CURVATURE, SPEED2, ENTRY_SPEED2, EXIT_SPEED2 = range(9)
 # Columns of the walks: one row is one mover. FIRST and LAST are the rows of its tour, as floats.
-ALONG, SPEED, DIRECTION, WAITED, TOP_SPEED, FIRST, LAST = range(7)
+ALONG, SPEED, DIRECTION, WAITED, TOP_SPEED, FIRST, LAST, YIELDS = range(8)
 
 
 def notice_gap(top_speed: float, period_s: float) -> float:
@@ -86,7 +86,9 @@ def _step(
     x, y, heading = point_on(tours, first, last, along)
     cos, sin = direction * math.cos(heading), direction * math.sin(heading)
 
-    gap = _gap_ahead(x, y, cos, sin, robot_x, robot_y, radius + robot_radius)
+    gap = math.inf
+    if walks[k, YIELDS] != 0.0:
+        gap = _gap_ahead(x, y, cos, sin, robot_x, robot_y, radius + robot_radius)
     for other in range(len(discs)):
         if other != k:
             gap = min(gap, _gap_ahead(x, y, cos, sin, discs[other, 0], discs[other, 1], radius + discs[other, 2]))
@@ -133,7 +135,7 @@ def walk(
     """Move all movers by some periods.
 
     Args:
-        walks: float64 [k, 7], one row a mover, columns as above; changed in place.
+        walks: float64 [k, 8], one row a mover, columns as above; changed in place.
         discs: float64 [k, 3], x, y and radius of each, m; changed in place.
         tours: float64 [pieces, 9], the pieces of all tours.
         robot_x: where the robot stands, m.

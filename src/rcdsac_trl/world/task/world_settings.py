@@ -8,9 +8,8 @@ from rcdsac_trl.robot.range_sensor import SENSORS, check_memory
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.checks import positive
 from rcdsac_trl.system.processes import resolve_num_workers
-from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import MapSettings, check_robot_fits
-from rcdsac_trl.world.maps.map_source import MapSource
+from rcdsac_trl.world.maps.map_source import MapSource, sources_of
 from rcdsac_trl.world.maps.planner import check_margin
 from rcdsac_trl.world.task.rules import TaskSettings
 
@@ -59,14 +58,16 @@ class WorldSettings:
         check_memory(self.memory_s)
         if not isinstance(self.robot, RobotSettings):
             raise UserInputError(f"robot={self.robot!r} is no robot: give a RobotSettings (docs/your-robot.md)")
-        if not isinstance(self.map_settings, MapSettings | FileMapSettings):
+        if not isinstance(self.map_settings, MapSource):
             raise UserInputError(
-                f"map_settings={self.map_settings!r} are none: give a MapSettings, or FileMapSettings(path=..)"
+                f"map_settings={self.map_settings!r} are none: give a MapSettings, a MapMixture of them, or "
+                "FileMapSettings(path=..)"
             )
         self.robot.sensor_mask(self.sensor)
-        if isinstance(self.map_settings, MapSettings):
-            check_robot_fits(self.map_settings, self.robot.circumradius_m, self.robot.name)
-        check_margin(self.map_settings.clearance_margin_m, self.robot.circumradius_m)
+        for source in sources_of(self.map_settings):
+            if isinstance(source, MapSettings):
+                check_robot_fits(source, self.robot.circumradius_m, self.robot.name)
+            check_margin(source.clearance_margin_m, self.robot.circumradius_m)
         if self.num_agents < 1:
             raise UserInputError(f"world.num_agents={self.num_agents} is below 1: raise it")
         resolve_num_workers(self.num_workers, self.num_agents)

@@ -56,6 +56,7 @@ class FileMapSettings:
         clearance_margin_m: what is kept free beyond the robot's radius, m.
         waypoint_clearance_m: clearance that waypoints keep where that costs little, m.
         detour_m: how far around the places that a piece of clutter takes a way past it may lead, m.
+        yielding_fraction: share of the movers that stop for a robot in their way, in [0, 1].
         connected_share: of all the floor where the robot fits, the share that must be one connected part, in which
             starts and goals lie; less is refused.
 
@@ -77,6 +78,7 @@ class FileMapSettings:
     clearance_margin_m: float = CLEARANCE_MARGIN_M
     waypoint_clearance_m: float = WAYPOINT_CLEARANCE_M
     detour_m: float = 0.5
+    yielding_fraction: float = 1.0
     connected_share: float = 0.5
 
     def __post_init__(self) -> None:
