@@ -153,7 +153,8 @@ def test_weights_of_format_1_keep_their_reading(tmp_path: Path) -> None:
     config = json.loads((tmp_path / "config.json").read_bytes())
     assert (config.pop("padding"), config.pop("format_version")) == ("none", FORMAT_VERSION)
     assert (config.pop("memory_s"), config.pop("range_code")) == (0.0, "paper")  # of agents of formats 1 and 2
-    assert (config.pop("robot")["name"], config.pop("restart_steps")) == ("paper", None)  # of agents of formats 1 to 3
+    unsaid_by_3 = config.pop("robot")["name"], config.pop("restart_steps"), config.pop("look_ahead")
+    assert unsaid_by_3 == ("paper", None, False)
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 1}))
     old = read_weights(tmp_path)
     assert old.config == weights.config

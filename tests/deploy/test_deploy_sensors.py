@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy import CameraPose, CloudFilter, Guard, Mount, Scan, Sectors, cloud_sectors, scan_sectors
-from rcdsac_trl.deploy.sensors.sectors import bins_of, nearest_by_sector
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import bins_of, nearest_by_sector
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.sim.lidar import sector_distances
 

@@ -20,14 +20,14 @@ from rcdsac_trl.deploy import (
     shipped_names,
 )
 from rcdsac_trl.deploy.frames.sensor_mounts import mount_of
-from rcdsac_trl.deploy.policy import guard as guards
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, SHIPPED, packed
 from rcdsac_trl.deploy.sensors.cloud import CameraPose
-from rcdsac_trl.deploy.sensors.sectors import Mount, mount_of_lidar
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot import guard as guards
 from rcdsac_trl.robot.range_sensor import LidarSettings
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.sectors import Mount, mount_of_lidar
 from rcdsac_trl.world.sim.lidar import sector_distances
 from robots import AHEAD, OPEN, STANDING, agent
 
@@ -75,7 +75,7 @@ def test_weights_of_before_drive_the_papers_robot(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(content)
     config = json.loads((tmp_path / "config.json").read_bytes())
     assert config.pop("format_version") == FORMAT_VERSION == 4
-    del config["robot"], config["restart_steps"]
+    del config["robot"], config["restart_steps"], config["look_ahead"]
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 3}))
     assert read_weights(tmp_path).config == agent().config
     for name in shipped_names():

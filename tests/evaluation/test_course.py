@@ -21,7 +21,6 @@ from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.deploy.policy.weights import packed
-from rcdsac_trl.deploy.sensors.sectors import Sectors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.course_drive import (
     Conditions,
@@ -39,6 +38,7 @@ from rcdsac_trl.evaluation.course.odometry import Odometry
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
 from rcdsac_trl.report.course_table import course_table, paper_course, write_course
 from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.office.building import make_office, polyline_m

@@ -102,6 +102,29 @@ def test_slow_motors_reach_their_share_of_what_they_are_told() -> None:
     made.close()
 
 
+def test_a_stop_zone_keeps_the_robot_from_what_its_sensor_sees() -> None:
+    """Told to drive straight on for good, the robot hits the next wall, or stands before it and is told so."""
+    ended = {}
+    for share in (0.0, 1.0):
+        made = group(TaskSettings(stop_zone_share=share))
+        touched = False
+        for _ in range(200):
+            made.step(np.array([[1.0, 0.0]], np.float32))
+            touched |= bool(made.buffers.contact[0, 0])
+        ended[share] = touched, made.buffers.velocity[0].tolist()
+        made.close()
+    assert ended[0.0][0]
+    assert ended[0.0][1][2] == pytest.approx(0.6)
+    assert not ended[1.0][0]
+    assert ended[1.0][1] == pytest.approx([0.0] * 4, abs=1e-6)
+
+
+def test_as_many_episodes_have_a_stop_zone_as_the_task_says() -> None:
+    task = TaskSettings(stop_zone_share=0.3)
+    drawn = [draw_disturbances(task, stream(0, "x", episode)).stop_zone for episode in range(2000)]
+    assert np.mean(drawn) == pytest.approx(0.3, abs=0.03)
+
+
 def test_an_episode_draws_its_own_whoever_drove_before() -> None:
     def drawn(episodes: list[int]) -> object:
         task = TaskSettings(**DRAWN)

@@ -276,6 +276,8 @@ def test_settings_turn_lists_into_tuples():
         ("pose_noise_std", (0.1, -0.1)),
         ("motor_slowness", 1.0),
         ("disturbances", "random"),
+        ("stop_zone_share", 1.1),
+        ("stop_zone_margin_m", -0.1),
     ],
 )
 def test_settings_outside_their_limits_are_refused(name, value):

@@ -10,14 +10,14 @@ from rcdsac_trl.deploy.policy.beta_controllers import (
     TailVarianceBeta,
 )
 from rcdsac_trl.deploy.policy.command import Command, Outlook
-from rcdsac_trl.deploy.policy.guard import Guard
 from rcdsac_trl.deploy.policy.input_checks import InputLimits, Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.deploy.policy.policy import Policy
 from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights, find_weights, read_weights, shipped_names
 from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
 from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors
-from rcdsac_trl.deploy.sensors.sectors import Mount, Sectors
+from rcdsac_trl.robot.guard import Guard
+from rcdsac_trl.robot.sectors import Mount, Sectors
 
 __all__ = [
     "AgentConfig",

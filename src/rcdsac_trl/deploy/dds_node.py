@@ -22,8 +22,8 @@ from rcdsac_trl.deploy.frames.robot_frames import FrameSettings, Localisation
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.topics import without_numbers
 from rcdsac_trl.deploy.sensors.scan import Meaning
-from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy.ros.dds_bridge import DdsBridge

@@ -29,8 +29,8 @@ from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
 from rcdsac_trl.deploy.ros.topics import DRIVING, readers_of, without_numbers, writers_of
-from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount
 
 # One node writes a topic as one type: not every middleware of ROS knows two of one name.
 _COMMAND_TYPES = {"TwistStamped": TwistStamped, "Twist": Twist}

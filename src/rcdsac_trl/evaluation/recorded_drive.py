@@ -18,9 +18,9 @@ from rcdsac_trl.deploy.recordings.sensor_recording import SensorRecording
 from rcdsac_trl.deploy.ros import messages
 from rcdsac_trl.deploy.ros.topics import without_numbers
 from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors
-from rcdsac_trl.deploy.sensors.sectors import Sectors
 from rcdsac_trl.evaluation.recording_survey import Survey
 from rcdsac_trl.robot.range_sensor import BIN_RAD
+from rcdsac_trl.robot.sectors import Sectors
 
 _STATIC = "/tf_static"
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
 from rcdsac_trl.deploy.sensors.cloud import CameraPose
-from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount
 
 # A scanner that is tilted more sees the floor, or over things, within the 3 m that agents look.
 _LARGEST_TILT_RAD = math.radians(10.0)

@@ -19,8 +19,8 @@ from rcdsac_trl.deploy.ros import messages
 from rcdsac_trl.deploy.sensors.arrays import described
 from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
 from rcdsac_trl.deploy.sensors.scan import Meaning, Scan, check_meaning
-from rcdsac_trl.deploy.sensors.sectors import Mount, Sectors, mount_of_lidar
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount, Sectors, mount_of_lidar
 
 # Of the frames whose clouds are not expected, so many are named.
 _MOST_FRAMES = 5

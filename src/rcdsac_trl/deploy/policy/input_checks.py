@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import masked, numbers_of
 from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, unsaid_readings
-from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MIN_RANGE_M, WAYPOINT_DISTANCE_LIMITS_M
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.sectors import Sectors, is_finite_number
 
 # Beyond these, or so many times what the robot can, a number is in another unit (mm, deg/s) or wrong: the paper's robot
 # drives a third of it.

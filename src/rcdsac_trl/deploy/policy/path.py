@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from rcdsac_trl.deploy.policy.polyline import Polyline, corners
 from rcdsac_trl.deploy.policy.weights import AgentConfig
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
-from rcdsac_trl.deploy.sensors.sectors import is_finite_number
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import is_finite_number
 
 # Waypoints are at most this far ahead along the path: the maps of training are 20 m wide.
 _LOOK_AHEAD_M = 20.0

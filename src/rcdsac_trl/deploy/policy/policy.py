@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.command import Command, Outlook
-from rcdsac_trl.deploy.policy.guard import Guard
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.policy.input_checks import (
     BadInputError,
@@ -21,11 +20,12 @@ from rcdsac_trl.deploy.policy.input_checks import (
 )
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
-from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number, is_whole_number
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.robot_settings import RobotSettings
+from rcdsac_trl.robot.sectors import Sectors, is_finite_number, is_whole_number
 
 if TYPE_CHECKING:
     from rcdsac_trl.robot.remembered_ranges import RememberedRanges

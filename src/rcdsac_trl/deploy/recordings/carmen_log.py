@@ -12,8 +12,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from rcdsac_trl.deploy.recordings.sensor_recording import ODOMETRY, SCAN, RecordedMessage
-from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount
 
 SCAN_TOPIC, ODOM_TOPIC = "/scan", "/odom"
 KEYWORDS = frozenset({"FLASER", "RLASER", "ROBOTLASER1", "ODOM", "PARAM", "SYNC", "TRUEPOS", "RAWLASER1"})

@@ -7,8 +7,8 @@ from typing import Any
 
 from rcdsac_trl.deploy.recordings.sensor_recording import RecordedMessage
 from rcdsac_trl.deploy.sensors.arrays import described
-from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount
 from rcdsac_trl.system.extras import needs
 
 

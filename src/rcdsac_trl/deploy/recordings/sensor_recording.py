@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from rcdsac_trl.deploy.sensors.sectors import Mount
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount
 
 SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"

@@ -15,8 +15,8 @@ from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.deploy.sensors.scan import Meaning, Scan
-from rcdsac_trl.deploy.sensors.sectors import Mount, is_finite_number
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount, is_finite_number
 
 # Drivers count the last angle to the last ray or to the one after it; more is another unit, or number of rays.
 _ANGLE_SLACK_RAYS, _ANGLE_SLACK_SHARE = 2.0, 0.05

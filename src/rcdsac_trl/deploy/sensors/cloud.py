@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
-from rcdsac_trl.deploy.sensors.sectors import (
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.sectors import (
     BODY_RADIUS_M,
     Sectors,
     bins_of,
@@ -16,8 +18,6 @@ from rcdsac_trl.deploy.sensors.sectors import (
     is_whole_number,
     nearest_by_sector,
 )
-from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import BIN_RAD, MAX_RANGE_M, NUM_BINS
 
 # Farther from the robot's centre, no camera is mounted: mm, then.
 _FARTHEST_CAMERA_M = 3.0

@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
-from rcdsac_trl.deploy.sensors.sectors import (
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
+from rcdsac_trl.robot.sectors import (
     BODY_RADIUS_M,
     Mount,
     Sectors,
@@ -30,8 +32,6 @@ from rcdsac_trl.deploy.sensors.sectors import (
     is_finite_number,
     nearest_by_sector,
 )
-from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.range_sensor import MAX_RANGE_M, NUM_BINS
 
 # More than a turn and a half of rays, or so many of them, is no scan.
 _LONGEST_SCAN_RAD = 3.0 * math.pi

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
-from rcdsac_trl.deploy.sensors.sectors import Sectors
+from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.world.office.depth_cameras import Mounted
 
 AHEAD_M = 0.18

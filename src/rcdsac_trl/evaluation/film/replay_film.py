@@ -4,10 +4,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rcdsac_trl.deploy.sensors.sectors import Sectors
 from rcdsac_trl.evaluation.film.video import Frame
 from rcdsac_trl.evaluation.recorded_drive import RecordedPeriod
 from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.render import Renderer, Scene
 

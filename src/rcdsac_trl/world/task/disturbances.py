@@ -15,7 +15,12 @@ Pose = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Disturbances:
-    """The disturbances of one episode; their fields are those of :class:`~rcdsac_trl.world.task.rules.TaskSettings`."""
+    """The disturbances of one episode.
+
+    Attributes:
+        stop_zone: whether one stands between agent and wheels; the others are those of
+            :class:`~rcdsac_trl.world.task.rules.TaskSettings`.
+    """
 
     range_noise_std_m: float
     range_dropout: float
@@ -23,6 +28,7 @@ class Disturbances:
     pose_noise_std: tuple[float, float]
     action_delay_steps: int
     motor_slowness: float
+    stop_zone: bool
 
 
 def draw_disturbances(task: TaskSettings, rng: np.random.Generator) -> Disturbances:
@@ -49,6 +55,7 @@ def draw_disturbances(task: TaskSettings, rng: np.random.Generator) -> Disturban
         pose_noise_std=_scaled(task.pose_noise_std, shares[3]),
         action_delay_steps=delay,
         motor_slowness=shares[4] * task.motor_slowness,
+        stop_zone=bool(rng.random() < task.stop_zone_share),
     )
 
 

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import Point, distance_and_bearing
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.maps.map_source import MapSource, make_map
@@ -131,6 +133,9 @@ class NavigationAgent:
         self._simulation.load(self._map, self._planner, self.pose, self._stream("movers"))
         self._noise = self._stream("noise")
         self._disturbances = draw_disturbances(self._task, self._stream("disturbances"))
+        self._guard = None
+        if self._disturbances.stop_zone:
+            self._guard = Guard.of(self._robot, margin_m=self._task.stop_zone_margin_m)
         self._pose_error = PoseError(self._disturbances.pose_noise_std, self._stream("pose_error"))
         self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._disturbances.action_delay_steps)
         self._goals_drawn = 0
@@ -147,7 +152,7 @@ class NavigationAgent:
     def step(self, action: Sequence[float]) -> None:
         """Take one agent step."""
         simulation, task, disturbances = self.simulation, self._task, self._disturbances
-        v_u, omega_u = desired_velocities(action, self._robot)
+        v_u, omega_u = self._guarded(*desired_velocities(action, self._robot))
         self._delayed.append((v_u, omega_u))
         v, omega = self._delayed.popleft()
         reached = 1.0 - disturbances.motor_slowness
@@ -168,6 +173,14 @@ class NavigationAgent:
         v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, disturbances.odometry_noise_std, self._noise)
         self.velocities = (v_c, omega_c, v_u, omega_u)
         self._sense(elapsed_s=self._motor_steps * self._robot.motor_period_s)
+
+    def _guarded(self, v_u: float, omega_u: float) -> tuple[float, float]:
+        """Return what a stop zone leaves of desired velocities; the robot is told that it wanted these."""
+        if self._guard is None:
+            return v_u, omega_u
+        seen = Sectors(np.where(self._mask, self.distances_m, math.inf), self._mask, self._robot.lidar.max_range_m)
+        v, omega, _ = self._guard.limit(v_u, omega_u, seen, self.velocities[:2])
+        return v, omega
 
     @property
     def next_waypoints(self) -> tuple[Point, Point]:

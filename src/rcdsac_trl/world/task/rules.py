@@ -62,6 +62,9 @@ class TaskSettings:
         pose_noise_std: standard deviations of the error of the pose that waypoints are told from, (m, rad); see
             :class:`~rcdsac_trl.world.task.disturbances.PoseError`.
         motor_slowness: share by which the robot drives and turns slower than it is told.
+        stop_zone_share: share of the episodes in which a stop zone stands between agent and wheels, as on a robot; see
+            :class:`rcdsac_trl.robot.guard.Guard`. It sees what the sensor sees.
+        stop_zone_margin_m: what that keeps free around the robot.
         disturbances: ``"fixed"``: noise, delay and slowness are what they say in every episode; ``"drawn"``: at most,
             every episode draws a share of each.
 
@@ -86,6 +89,8 @@ class TaskSettings:
     action_delay_steps: int = 0
     pose_noise_std: tuple[float, float] = (0.0, 0.0)
     motor_slowness: float = 0.0
+    stop_zone_share: float = 0.0
+    stop_zone_margin_m: float = 0.05
     disturbances: Literal["fixed", "drawn"] = "fixed"
 
     def __post_init__(self) -> None:
@@ -126,6 +131,10 @@ class TaskSettings:
                 raise UserInputError(f"{name}={list(pair)} must be two numbers of 0 or more: {units}")
         if not 0.0 <= self.motor_slowness < 1.0:
             raise UserInputError(f"motor_slowness={self.motor_slowness} is a share of the speed: give 0 to below 1")
+        if not 0.0 <= self.stop_zone_share <= 1.0:
+            raise UserInputError(f"stop_zone_share={self.stop_zone_share} is a share of the episodes; give 0 to 1")
+        if not 0.0 <= self.stop_zone_margin_m <= 1.0:
+            raise UserInputError(f"stop_zone_margin_m={self.stop_zone_margin_m} must be 0 to 1 metres")
         if self.disturbances not in ("fixed", "drawn"):
             raise UserInputError(f"disturbances={self.disturbances!r} does not exist: choose fixed or drawn")
         if self.action_delay_steps < 0:

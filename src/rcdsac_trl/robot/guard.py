@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.sensors.sectors import Sectors, check_switches
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.sectors import Sectors, check_switches
 
 # Shares of the wanted speed that are tried, the fastest first.
 _SHARES = (1.0, 0.75, 0.5, 0.25)
