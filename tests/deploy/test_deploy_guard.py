@@ -1,6 +1,7 @@
 """Speed limit and stop zone: closed forms on plain scenes, and no collision in any scene, whatever is commanded."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,101 @@ def test_it_drives_blind_neither_way_unless_told_to() -> None:
 
 def free_distance(x: float, y: float, segments: np.ndarray, circles: np.ndarray) -> float:
     return float(sector_distances(x, y, 0.0, segments, circles).min())
+
+
+# ------------------------------------------------------------------------------------------------ ways out
+def beside_the_way(gap_m: float, y: float) -> Sectors:
+    """A thing of 10 cm radius whose middle is off the way, so far before the robot's circle."""
+    x = math.sqrt((0.25 + gap_m + 0.1) ** 2 - y * y)
+    return Sectors(sector_distances(0.0, 0.0, 0.0, NO_SEGMENTS, np.array([[x, y, 0.1]])), ALL)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_where_it_would_stand_for_good_it_turns_away_from_what_is_in_the_way(side: float) -> None:
+    seen = beside_the_way(0.05, side * 0.3)
+    assert replace(Guard(), evade=False).limit(0.3, 0.0, seen) == (0.0, 0.0, "the stop zone")
+    v, omega, reason = Guard().limit(0.3, 0.0, seen)
+    assert (v <= 0.2, reason) == (True, "the stop zone")
+    assert omega * side < 0.0  # to the other side
+
+
+def test_before_what_it_cannot_pass_it_turns_the_shorter_way() -> None:
+    """A corner: a wall ahead, and one to the left; to the right the way is free."""
+    walls = np.array([[0.27, -9.0, 0.27, 9.0], [-9.0, 0.27, 9.0, 0.27]])
+    seen = Sectors(sector_distances(0.0, 0.0, 0.0, walls, NO_CIRCLES), ALL)
+    for wish in (-0.5, 0.0):
+        v, omega, reason = Guard().limit(0.6, wish, seen)
+        assert (v, reason) == (0.0, "the stop zone")
+        assert omega < -0.5
+    enclosed = Sectors(np.full(180, 0.27), ALL)
+    assert Guard().limit(0.6, 0.3, enclosed) == (0.0, 0.3, "the stop zone")
+
+
+def test_it_gets_around_a_post_that_it_would_stand_before() -> None:
+    """The driver wants straight on to a goal behind the post, and knows nothing of it."""
+
+    def nearest_m(evade: bool) -> float:
+        guard, circles = replace(Guard(), evade=evade), np.array([[1.0, 0.02, 0.1]])
+        x = y = yaw = v = omega = 0.0
+        nearest = math.inf
+        for _ in range(300):
+            bearing = math.remainder(math.atan2(-y, 2.5 - x) - yaw, 2.0 * math.pi)
+            wish = 0.4 * max(0.2, math.cos(bearing)), max(-1.5, min(1.5, 2.0 * bearing))
+            seen = Sectors(sector_distances(x, y, yaw, NO_SEGMENTS, circles), ALL)
+            command = guard.limit(*wish, seen, (v, omega))[:2]
+            for _ in range(7):
+                v, omega = clip_command(*command, v, omega)
+                yaw += omega * 0.02
+                x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
+            assert free_distance(x, y, NO_SEGMENTS, circles) > guard.radius_m
+            nearest = min(nearest, math.dist((x, y), (2.5, 0.0)))
+        return nearest
+
+    assert nearest_m(evade=False) > 1.5
+    assert nearest_m(evade=True) < 0.2
+
+
+AHEAD_ONLY = (np.arange(180) < 21) | (np.arange(180) >= 158)
+
+
+def test_it_backs_where_it_has_been_and_nowhere_else() -> None:
+    seen = Sectors(np.full(180, np.inf), AHEAD_ONLY)
+    been = np.column_stack([np.linspace(-0.6, 0.0, 31), np.zeros(31)])
+    assert Guard().limit(-0.2, 0.0, seen, been=been) == (-0.2, 0.0, None)
+    assert Guard().limit(-0.2, 1.5, seen, (-0.2, 1.5), been=been)[0] > -0.2  # off its way
+    assert Guard().limit(-0.2, 0.0, seen, been=been[-3:])[0] > -0.2  # it came from 4 cm behind
+    assert Guard().limit(-0.2, 0.0, seen, been=been[-1:])[0] == 0.0
+    assert Guard().limit(-0.2, 0.0, seen, been=np.empty((0, 2)))[0] == 0.0
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_who_sees_ahead_alone_never_backs_into_what_stands(seed: int) -> None:
+    """Whatever is commanded; what it never saw beside it, it may touch as it drives on."""
+    rng = np.random.default_rng(seed)
+    circles = np.column_stack([rng.uniform(-2, 2, (25, 2)), rng.uniform(0.02, 0.2, 25)])
+    guard = Guard()
+    if free_distance(0.0, 0.0, NO_SEGMENTS, circles) < guard.radius_m + guard.margin_m:
+        return
+    x = y = yaw = v = omega = 0.0
+    trail = [(0.0, 0.0)]
+    for step in range(150):
+        if step % 8 == 0:
+            wanted = float(rng.choice([0.4, -0.2, -0.04])), float(rng.uniform(-1.0, 1.0))
+        seen_m = sector_distances(x, y, yaw, NO_SEGMENTS, circles)
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        been = (np.array(trail) - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+        seen = Sectors(np.where(AHEAD_ONLY, seen_m, np.inf), AHEAD_ONLY)
+        command = guard.limit(*wanted, seen, (v, omega), been)[:2]
+        for _ in range(7):
+            v, omega = clip_command(*command, v, omega)
+            yaw += omega * 0.02
+            x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
+            if free_distance(x, y, NO_SEGMENTS, circles) < guard.radius_m:
+                assert v > 0.0
+                return
+        if v > 0.0 and math.dist(trail[-1], (x, y)) > 0.02:
+            trail.append((x, y))
 
 
 @settings(max_examples=40, deadline=None)
@@ -130,7 +226,9 @@ def test_it_decides_as_the_definition_says(guard: Guard) -> None:
         sectors = Sectors(np.where(there, rng.uniform(nearest, nearest + 0.4, 180), np.inf), ALL)
         (v, omega), moving = rng.uniform((-0.2, -1.5), (0.6, 1.5)), rng.uniform((-0.3, -1.5), (0.8, 1.5))
         expected = plain_limit(guard, v, sectors, omega, moving)
-        assert guard.limit(v, omega, sectors, moving)[0] == expected
+        assert replace(guard, evade=False).limit(v, omega, sectors, moving)[0] == expected
+        if v < 0.0 or expected > 0.0:  # else it evades
+            assert guard.limit(v, omega, sectors, moving)[:2] == (expected, omega)
         decided.add(round(expected / v, 2))
     assert decided == {0.0, 0.25, 0.5, 0.75, 1.0}
 

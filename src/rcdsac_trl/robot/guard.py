@@ -2,11 +2,11 @@
 
 The stop zone is the way the robot would still go if it did what it is told for one more reaction time and then braked:
 the whole way must keep its distance from everything that the range sensor sees. What lies behind an obstacle counts as
-obstacle.
+obstacle. Where the wish leads into it at any speed, the robot creeps along beside it, or turns until it can.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,18 @@ _LARGEST = {
     "margin_m": 2.0,
     "reaction_s": 5.0,
 }
+# Turns that are tried where the wanted one leads into the stop zone, shares of the fastest.
+_TURNS = np.linspace(-1.0, 1.0, 9)
+# On a way that nobody asked for the robot creeps at most so fast, m/s; a way that allows less than this share of it
+# often leads only to the last centimetre.
+_CREEP_M_PER_S, _WORTH_IT = 0.2, 0.5
+# The robot turns away from what it cannot pass at this share of its fastest turn, by headings so many sectors apart.
+_TURN_SHARE, _HEADING_BINS = 0.5, 5
+# Beside where the robot has been, its edge may come by this much: what the places between two calls leave open.
+_BESIDE_M = 0.01
+_EDGE = np.stack(
+    (np.cos(np.arange(0.0, 2.0 * math.pi, math.pi / 12)), np.sin(np.arange(0.0, 2.0 * math.pi, math.pi / 12))), axis=1
+)
 # Below, the robot stands.
 _STANDS_M_PER_S = 1e-9
 
@@ -66,6 +78,8 @@ class Guard:
             along it or away from it, and nearer by 1 cm a call, the blur of a sector, until 1 cm is left.
         reaction_s: how long a command may last until the next one arrives and acts.
         blind_reverse: whether the robot may drive backwards (or forwards) where it senses nothing at all.
+        evade: whether it may turn otherwise than it was told where it would stand for good: it creeps along beside what
+            is in the way, or turns on the spot until it can.
         robot: which one it is; how fast it speeds up and brakes, and its outline, count.
 
     Raises:
@@ -84,11 +98,12 @@ class Guard:
     margin_m: float = 0.05
     reaction_s: float = 0.25
     blind_reverse: bool = False
+    evade: bool = True
     robot: RobotSettings = PAPER
 
     def __post_init__(self) -> None:
         """Refuse what is no limit."""
-        check_switches(self, "blind_reverse")
+        check_switches(self, "blind_reverse", "evade")
         _check_robot(self.robot)
         for name in ("max_speed_m_per_s", "max_reverse_m_per_s", "max_turn_rad_per_s", "margin_m", "reaction_s"):
             if not 0.0 <= getattr(self, name) < math.inf:
@@ -124,17 +139,26 @@ class Guard:
         return cls(**{**limits, **changes, "robot": robot})
 
     def limit(
-        self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float] = (0.0, 0.0)
+        self,
+        v: float,
+        omega: float,
+        sectors: Sectors,
+        moving: tuple[float, float] = (0.0, 0.0),
+        been: NDArray[np.float64] | None = None,
     ) -> tuple[float, float, str | None]:
         """Return the velocities that may be driven, and why they are not those that were wanted.
 
-        The linear velocity is lowered, to 0 if need be; turning on the spot is always allowed.
+        The linear velocity is lowered, to 0 if need be; turning on the spot is always allowed. Where it would be 0, and
+        the robot may evade, it creeps with another turn, the nearest to the wish that keeps the stop zone free; where
+        there is none, it turns towards the nearest heading in which there is.
 
         Args:
             v: wanted linear velocity, m/s.
             omega: wanted angular velocity, rad/s.
             sectors: what the range sensor sees, all of it, not just what the agent sees.
             moving: measured velocities, m/s and rad/s.
+            been: where the robot's centre has been while it drove ahead, [k, 2], m, in its frame now: nothing stands
+                there, so it may drive back that way without sensing it. None: nobody knows.
         """
         fast, turning = v, omega
         v = min(max(v, -self.max_reverse_m_per_s), self.max_speed_m_per_s)
@@ -142,27 +166,80 @@ class Guard:
         reason = None if (v, omega) == (fast, turning) else "the speed limit"
         if v == 0.0:
             return v, omega, reason
-        if not self.blind_reverse and not np.count_nonzero(sectors.covered[_AHEAD if v > 0.0 else _BEHIND]):
+        if self.blind_reverse or np.count_nonzero(sectors.covered[_AHEAD if v > 0.0 else _BEHIND]):
+            been = None  # it sees where it goes
+        elif v > 0.0 or been is None:
             return 0.0, omega, f"nothing senses what lies {'ahead' if v > 0 else 'behind'}"
-        share = self._fastest(v, omega, sectors, moving)
+        share = self._fastest(v, omega, sectors, moving, been)
+        if share == 0.0 and self.evade and v > 0.0:
+            return *self._evading(v, omega, sectors, moving), "the stop zone"
         if share == 0.0:
             return 0.0, omega, "the stop zone"
         return share * v, omega, reason if share == 1.0 else "the stop zone"
 
-    def _fastest(self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float]) -> float:
-        """Return the largest of the shares of `v` whose way keeps its distance, 0 if none does."""
+    def _evading(self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float]) -> tuple[float, float]:
+        """Return velocities that lead past what is in the way: creeping, or else turning on the spot."""
+        creep = min(v, _CREEP_M_PER_S)
+        turns = self.max_turn_rad_per_s * _TURNS
+        turns = turns[np.argsort(np.abs(turns - omega), kind="stable")].tolist()
+        shares = [self._fastest(creep, turn, sectors, moving) for turn in turns]
+        if (share := next((share for share in shares if share >= _WORTH_IT), 0.0)) > 0.0:
+            return share * creep, turns[shares.index(share)]
+        if (turn := self._turn_to_a_way(creep, omega, sectors)) is not None:
+            return 0.0, turn
+        share = max(shares)
+        return share * creep, omega if share == 0.0 else turns[shares.index(share)]
+
+    def _turn_to_a_way(self, creep: float, omega: float, sectors: Sectors) -> float | None:
+        """Return the turn that leads to the nearest heading in which the robot could creep on; None without one."""
+        side = 1.0 if omega >= 0.0 else -1.0
+        for bins in range(_HEADING_BINS, NUM_BINS // 2 + 1, _HEADING_BINS):
+            for way in (side, -side):
+                turned = np.roll(sectors.distances_m, -round(way * bins))
+                if self._fastest(creep, 0.0, replace(sectors, distances_m=turned), (0.0, 0.0)) >= _WORTH_IT:
+                    return way * _TURN_SHARE * self.max_turn_rad_per_s
+        return None
+
+    def _fastest(
+        self,
+        v: float,
+        omega: float,
+        sectors: Sectors,
+        moving: tuple[float, float],
+        been: NDArray[np.float64] | None = None,
+    ) -> float:
+        """Return the largest of the shares of `v` whose way keeps its distance, 0 if none does.
+
+        With `been`, the way must lead where the robot has been, too.
+        """
         # Along a border, both sectors beside it are seen: whatever is inside a sector lies between its borders, at its
         # distance or farther.
         nearest = np.minimum(sectors.distances_m, sectors.distances_m[_SECTORS_BEFORE])
         # What is out of reach of the whole way cannot be near to any of it.
         seen = nearest < self._reach(max(abs(v), abs(moving[0])))
-        if not np.count_nonzero(seen):
+        if been is None and not np.count_nonzero(seen):
             return 1.0
-        clearance = self._clearances(*self._ways(v, omega, moving), _BORDERS[:, seen], nearest[seen])
-        now = float(clearance[0, 0])
-        needed = min(self.margin_m, max(now - _BLUR_M, _LEAST_M), now)
-        least = clearance.min(axis=1).tolist()
-        return next((share for share, left in zip(_SHARES, least, strict=True) if left >= needed), 0.0)
+        places, headings = self._ways(v, omega, moving)
+        allowed = np.ones(len(_SHARES), np.bool_)
+        if np.count_nonzero(seen):
+            clearance = self._clearances(places, headings, _BORDERS[:, seen], nearest[seen])
+            now = float(clearance[0, 0])
+            allowed = clearance.min(axis=1) >= min(self.margin_m, max(now - _BLUR_M, _LEAST_M), now)
+        if been is not None:
+            allowed &= self._has_been(places, been)
+        return next((share for share, free in zip(_SHARES, allowed.tolist(), strict=True) if free), 0.0)
+
+    def _has_been(self, places: NDArray[np.float64], been: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return of which ways all places lie within where the robot has been, bool [shares].
+
+        Args:
+            places: of its centre, [shares, n, 2].
+            been: where it was, [k, 2].
+        """
+        edge = places[:, :, None] + (self.radius_m - _BESIDE_M) * _EDGE
+        apart = edge[:, :, :, None] - been
+        covered = np.square(apart).sum(axis=-1).min(axis=-1, initial=np.inf) <= self.radius_m**2
+        return np.asarray(covered.all(axis=(1, 2)))
 
     def _clearances(
         self,
