@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rcdsac_trl.deploy import Guard, PathFollower, Sectors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
+from rcdsac_trl.robot.compiled_guard import CompiledGuard
 from rcdsac_trl.world.sim.lidar import sector_distances
 from robots import agent
 
@@ -227,6 +228,8 @@ def test_it_decides_as_the_definition_says(guard: Guard) -> None:
         (v, omega), moving = rng.uniform((-0.2, -1.5), (0.6, 1.5)), rng.uniform((-0.3, -1.5), (0.8, 1.5))
         expected = plain_limit(guard, v, sectors, omega, moving)
         assert replace(guard, evade=False).limit(v, omega, sectors, moving)[0] == expected
+        compiled = CompiledGuard(**vars(guard))
+        assert compiled.limit(v, omega, sectors, moving) == guard.limit(v, omega, sectors, moving)
         if v < 0.0 or expected > 0.0:  # else it evades
             assert guard.limit(v, omega, sectors, moving)[:2] == (expected, omega)
         decided.add(round(expected / v, 2))

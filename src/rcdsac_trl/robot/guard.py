@@ -18,13 +18,13 @@ from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors, check_switches
 
 # Shares of the wanted speed that are tried, the fastest first.
-_SHARES = (1.0, 0.75, 0.5, 0.25)
+SHARES = (1.0, 0.75, 0.5, 0.25)
 # Time from one place on the way to the next, s: 3 cm at full speed.
-_STEP_S = 0.05
+STEP_S = 0.05
 # What is in a sector may be anywhere in it, so a wall beside the robot looks up to this much nearer farther on: who is
 # within the margin may seem to come so much nearer, but never below the least that must stay.
-_BLUR_M = 0.01
-_LEAST_M = 0.01
+BLUR_M = 0.01
+LEAST_M = 0.01
 # Half the angle ahead (or behind) in which something must be sensed at all before the robot moves that way.
 _WAY_RAD = math.radians(30.0)
 
@@ -50,7 +50,7 @@ _EDGE = np.stack(
     (np.cos(np.arange(0.0, 2.0 * math.pi, math.pi / 12)), np.sin(np.arange(0.0, 2.0 * math.pi, math.pi / 12))), axis=1
 )
 # Below, the robot stands.
-_STANDS_M_PER_S = 1e-9
+STANDS_M_PER_S = 1e-9
 
 _ANGLES = np.arange(NUM_BINS) * BIN_RAD
 # Border i is the one between sectors i - 1 and i.
@@ -212,22 +212,27 @@ class Guard:
 
         With `been`, the way must lead where the robot has been, too.
         """
+        borders, nearest = self._within_reach(sectors, max(abs(v), abs(moving[0])))
+        if been is None and not len(nearest):
+            return 1.0
+        places, headings = self._ways(v, omega, moving)
+        allowed = np.ones(len(SHARES), np.bool_)
+        if len(nearest):
+            clearance = self._clearances(places, headings, borders, nearest)
+            now = float(clearance[0, 0])
+            allowed = clearance.min(axis=1) >= min(self.margin_m, max(now - BLUR_M, LEAST_M), now)
+        if been is not None:
+            allowed &= self._has_been(places, been)
+        return next((share for share, free in zip(SHARES, allowed.tolist(), strict=True) if free), 0.0)
+
+    def _within_reach(self, sectors: Sectors, speed: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the directions of what is in reach of who is never faster, [2, m], and how far it is, m, [m]."""
         # Along a border, both sectors beside it are seen: whatever is inside a sector lies between its borders, at its
         # distance or farther.
         nearest = np.minimum(sectors.distances_m, sectors.distances_m[_SECTORS_BEFORE])
         # What is out of reach of the whole way cannot be near to any of it.
-        seen = nearest < self._reach(max(abs(v), abs(moving[0])))
-        if been is None and not np.count_nonzero(seen):
-            return 1.0
-        places, headings = self._ways(v, omega, moving)
-        allowed = np.ones(len(_SHARES), np.bool_)
-        if np.count_nonzero(seen):
-            clearance = self._clearances(places, headings, _BORDERS[:, seen], nearest[seen])
-            now = float(clearance[0, 0])
-            allowed = clearance.min(axis=1) >= min(self.margin_m, max(now - _BLUR_M, _LEAST_M), now)
-        if been is not None:
-            allowed &= self._has_been(places, been)
-        return next((share for share, free in zip(_SHARES, allowed.tolist(), strict=True) if free), 0.0)
+        seen = nearest < self._reach(speed)
+        return _BORDERS[:, seen], nearest[seen]
 
     def _has_been(self, places: NDArray[np.float64], been: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return of which ways all places lie within where the robot has been, bool [shares].
@@ -256,14 +261,24 @@ class Guard:
             borders: directions in which something is, of unit length, [2, m].
             nearest: how far from here on there may be something, m, [m].
         """
-        if self.robot.is_round or self.radius_m > self.robot.circumradius_m:
+        if self._is_a_disc:
             return _distances(places, borders, nearest) - self.radius_m
         return _outline_distances(self.robot.outline, places, directions, borders, nearest)
+
+    @property
+    def _is_a_disc(self) -> bool:
+        """Whether the circle around the robot is guarded, and not its outline."""
+        return self.robot.is_round or self.radius_m > self.robot.circumradius_m
+
+    @property
+    def _reacting(self) -> int:
+        """How many steps a command may last."""
+        return math.ceil(self.reaction_s / STEP_S - 1e-9)
 
     def _reach(self, speed: float) -> float:
         """Return how near to here, m, something must be to matter to who is never faster than `speed`."""
         return (
-            self.radius_m + self.margin_m + speed * (self.reaction_s + _STEP_S) + self.robot.stopping_distance_m(speed)
+            self.radius_m + self.margin_m + speed * (self.reaction_s + STEP_S) + self.robot.stopping_distance_m(speed)
         )
 
     def _ways(
@@ -275,12 +290,12 @@ class Guard:
             Places [shares, n, 2], m; who stands before the others do stays where it is. And cosine and sine of the
             heading there, [n, 2], which does not depend on the speed.
         """
-        reacting = math.ceil(self.reaction_s / _STEP_S - 1e-9)
+        reacting = self._reacting
         braking, turning = self.robot.max_acceleration_m_per_s2, self.robot.max_angular_acceleration
-        speeds = [_until_it_stands(share * v, moving[0], reacting, braking) for share in _SHARES]
+        speeds = [_until_it_stands(share * v, moving[0], reacting, braking) for share in SHARES]
         steps = max(len(of_share) for of_share in speeds)
-        covered_m = np.array([of_share + [0.0] * (steps - len(of_share)) for of_share in speeds]) * _STEP_S
-        places = np.zeros((len(_SHARES), steps + 1, 2))
+        covered_m = np.array([of_share + [0.0] * (steps - len(of_share)) for of_share in speeds]) * STEP_S
+        places = np.zeros((len(SHARES), steps + 1, 2))
         on_the_way, headings = _directions(omega, moving[1], reacting, steps, turning)
         np.cumsum(covered_m[:, :, None] * on_the_way, axis=1, out=places[:, 1:])
         return places, headings
@@ -294,8 +309,8 @@ def _check_robot(robot: object) -> None:
 def _until_it_stands(v: float, now: float, reacting: int, acceleration: float) -> list[float]:
     """Return the linear velocity in each step: `v` is wanted in the first ones, and to stand from then on."""
     speeds: list[float] = []
-    while len(speeds) < reacting or abs(now) > _STANDS_M_PER_S:
-        now = _nearer(v if len(speeds) < reacting else 0.0, now, acceleration * _STEP_S)
+    while len(speeds) < reacting or abs(now) > STANDS_M_PER_S:
+        now = _nearer(v if len(speeds) < reacting else 0.0, now, acceleration * STEP_S)
         speeds.append(now)
     return speeds
 
@@ -309,8 +324,8 @@ def _directions(
     """
     yaw, directions, headings = 0.0, [], [(1.0, 0.0)]
     for step in range(steps):
-        now = _nearer(omega if step < reacting else 0.0, now, acceleration * _STEP_S)
-        half = now * _STEP_S / 2.0
+        now = _nearer(omega if step < reacting else 0.0, now, acceleration * STEP_S)
+        half = now * STEP_S / 2.0
         directions.append((math.cos(yaw + half), math.sin(yaw + half)))
         yaw += 2.0 * half
         headings.append((math.cos(yaw), math.sin(yaw)))

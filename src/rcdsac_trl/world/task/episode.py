@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
-from rcdsac_trl.robot.guard import Guard
+from rcdsac_trl.robot.compiled_guard import CompiledGuard
 from rcdsac_trl.robot.observation import Point, distance_and_bearing
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
@@ -135,7 +135,7 @@ class NavigationAgent:
         self._disturbances = draw_disturbances(self._task, self._stream("disturbances"))
         self._guard = None
         if self._disturbances.stop_zone:
-            self._guard = Guard.of(self._robot, margin_m=self._task.stop_zone_margin_m)
+            self._guard = CompiledGuard.of(self._robot, margin_m=self._task.stop_zone_margin_m)
         self._pose_error = PoseError(self._disturbances.pose_noise_std, self._stream("pose_error"))
         self._delayed: deque[tuple[float, float]] = deque([(0.0, 0.0)] * self._disturbances.action_delay_steps)
         self._goals_drawn = 0
