@@ -205,20 +205,31 @@ class Critics:
             action: u, [2].
             embedded: ``beta`` in [0, 1]; None where the networks read none.
         """
-        size = memories.shape[1]
-        read = np.empty((len(memories), 1, size + len(action)), dtype=np.float32)
-        read[:, 0, :size], read[:, 0, size:] = memories, action
+        return self.of_actions(memories, action[None], embedded)[0]
+
+    def of_actions(self, memories: Array, actions: Array, embedded: float | None) -> Array:
+        """Return what :meth:`values` says of each of several actions, [K, N], or [K, 1] of scalar critics.
+
+        Args:
+            memories: of each critic, [C, memory].
+            actions: [K, 2].
+            embedded: ``beta`` in [0, 1]; None where the networks read none.
+        """
+        (critics, size), asked = memories.shape, len(actions)
+        read = np.empty((critics, asked, size + actions.shape[1]), dtype=np.float32)
+        read[:, :, :size], read[:, :, size:] = memories[:, None], actions
         x = _rectified(read, self._input)
         if self._gate is not None:
             gate = self._gate
             if self._beta is not None and embedded is not None:
                 gate = gate + _cosines(embedded, self._angles) @ self._beta
-            x = x * np.maximum(gate, _ZERO)
+            gated = x[:, :, None] * np.maximum(gate, _ZERO)[:, None]
+            x = gated.reshape(critics, -1, gated.shape[-1])
         weight, bias = self._output
         values = _rectified(x, self._hidden) @ weight
         values += bias
         # Networks may cross their quantiles a little; in rising order they are never farther from the true ones.
-        return np.minimum.reduce(np.sort(values, axis=1))[:, 0]
+        return np.minimum.reduce(np.sort(values.reshape(critics, asked, -1), axis=2))
 
 
 def _rectified(x: Array, layer: tuple[Array, Array]) -> Array:
