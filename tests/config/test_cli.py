@@ -230,7 +230,7 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
         *((verb, "run=", "run") for verb in ("evaluate", "calibrate", "course", "export", "plot_training", "replay")),
         *(
             (verb, "out=", "out")
-            for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps", "replay")
+            for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps", "replay", "play")
         ),
         ("plot_training", "out='  '", "out"),
         ("course", "run=[sac-narrow,'']", "run"),

@@ -115,6 +115,7 @@ class ValueFigure:
         )
         plot.grid.visible = False
         plot.yaxis.ticker = [-90, -45, 0, 45, 90]
+        plot.xaxis.ticker.desired_num_ticks = 5
         self._image = ColumnDataSource(data={"image": [], "x": [], "y": [], "dw": [], "dh": []})
         self._chosen = ColumnDataSource(data={"x": [], "y": [], "marker": [], "size": []})
         plot.image("image", x="x", y="y", dw="dw", dh="dh", source=self._image, color_mapper=self._mapper)

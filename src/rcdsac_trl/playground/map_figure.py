@@ -20,6 +20,17 @@ _GOAL_RADII_M = (0.34, 0.15)
 _WAYPOINT_RADIUS_M = 0.11
 _CONTACT_RADIUS_M = 0.22
 _REMEMBERED_RADIUS_M = 0.05
+_ENDS = ("x0", "y0", "x1", "y1")
+# What is drawn, from the ground up, each with one glyph, and its columns.
+_COLUMNS = {
+    "static": ("xs", "ys", "fill"),
+    "round": ("x", "y", "radius", "fill"),
+    "fans": ("xs", "ys", "fill", "alpha"),
+    "trail": (*_ENDS, "speed"),
+    "lines": (*_ENDS, "color", "width", "dash"),
+    "discs": ("x", "y", "radius", "fill", "alpha", "line"),
+    "body": ("xs", "ys", "fill", "line"),
+}
 
 
 class MapRanges:
@@ -70,13 +81,10 @@ class MapFigure:
         plot.axis.visible = False
         plot.grid.visible = False
         plot.outline_line_color = None
-        names = ("static", "fans", "lines", "trail", "discs", "body")
-        self._sources = {source: ColumnDataSource() for source in names}
-        self._round = ColumnDataSource(data={"x": [], "y": [], "radius": [], "fill": []})
-        self._reset()
+        self._sources = {name: ColumnDataSource(data={key: [] for key in keys}) for name, keys in _COLUMNS.items()}
         speeds = LinearColorMapper(palette=Plasma256[20:240], low=0.0, high=MAX_LINEAR_VELOCITY)
         plot.patches("xs", "ys", source=self._sources["static"], fill_color="fill", line_color="fill", line_width=0.5)
-        plot.circle("x", "y", radius="radius", source=self._round, fill_color="fill", line_color=None)
+        plot.circle("x", "y", radius="radius", source=self._sources["round"], fill_color="fill", line_color=None)
         plot.patches("xs", "ys", source=self._sources["fans"], fill_color="fill", fill_alpha="alpha", line_color=None)
         plot.segment(
             "x0",
@@ -123,30 +131,37 @@ class MapFigure:
         drag = PointDrawTool(renderers=[held], add=False, drag=True)
         plot.add_tools(drag)
         plot.toolbar.active_tap = drag
-        self._scale_bar = ScaleBar(
-            range=ranges.x,
-            unit="m",
-            orientation="horizontal",
-            location="bottom_left",
-            bar_length=0.2,
-            background_fill_alpha=0.0,
-            border_line_color=None,
-            bar_line_width=2,
-            padding=6,
-            margin=6,
-        )
-        plot.add_layout(self._scale_bar)
+        self._scale_bar: ScaleBar | None = None
         self._steps = -1
 
     def _reset(self) -> None:
-        self._sources["trail"].data = {key: np.empty(0, np.float32) for key in ("x0", "y0", "x1", "y1", "speed")}
+        self._sources["trail"].data = {key: np.empty(0, np.float32) for key in _COLUMNS["trail"]}
         self._steps = -1
 
     def restyle(self, colors: Colors) -> None:
         """Take another theme's colours, but for what is copied."""
         self.figure.background_fill_color = colors["floor"]
         self.figure.border_fill_color = colors["outside"]
-        self._scale_bar.update(label_text_color=colors["ink"], bar_line_color=colors["ink"])
+        # A new one: a browser draws it once.
+        if self._scale_bar is not None:
+            self.figure.center.remove(self._scale_bar)
+        self._scale_bar = ScaleBar(
+            range=self._ranges.x,
+            unit="m",
+            orientation="horizontal",
+            location="bottom_left",
+            bar_length=0.15,
+            bar_line_width=2,
+            bar_line_color=colors["ink"],
+            label_text_color=colors["ink"],
+            label_standoff=2,
+            background_fill_color=colors["floor"],
+            background_fill_alpha=0.6,
+            border_line_color=None,
+            padding=4,
+            margin=14,
+        )
+        self.figure.add_layout(self._scale_bar)
 
     def draw_map(self, map_: Map, colors: Colors) -> None:
         """Draw what stands, and begin the trail anew."""
@@ -157,7 +172,7 @@ class MapFigure:
             "ys": [corner[:, 1] for corner in corners],
             "fill": [colors["wall"] if box.wall else _clutter(box.mapped, colors) for box in boxes],
         }
-        self._round.data = {
+        self._sources["round"].data = {
             "x": [piece.x for piece in map_.cylinders],
             "y": [piece.y for piece in map_.cylinders],
             "radius": [piece.radius for piece in map_.cylinders],
@@ -178,7 +193,7 @@ class MapFigure:
         way = np.concatenate([view.way[:-1], view.way[1:]], axis=1)
         lines = np.concatenate([sensor.hits, way]).astype(np.float32)
         self._sources["lines"].data = {
-            **{key: lines[:, column] for column, key in enumerate(("x0", "y0", "x1", "y1"))},
+            **{key: lines[:, column] for column, key in enumerate(_ENDS)},
             "color": [colors["hit"]] * len(sensor.hits) + [colors["way"]] * len(way),
             "width": [2.5] * len(sensor.hits) + [1.5] * len(way),
             "dash": ["solid"] * len(sensor.hits) + ["dashed"] * len(way),
@@ -235,5 +250,4 @@ def _discs(view: RobotView, colors: Colors) -> dict[str, list]:
         rows.append((x, y, _REMEMBERED_RADIUS_M, colors["remembered"], 0.7, colors["remembered"]))
     for x, y, radius in view.expected.tolist():
         rows.append((x, y, radius, colors["remembered"], 0.0, colors["remembered"]))
-    keys = ("x", "y", "radius", "fill", "alpha", "line")
-    return {key: list(column) for key, column in zip(keys, zip(*rows, strict=True), strict=True)}
+    return {key: list(column) for key, column in zip(_COLUMNS["discs"], zip(*rows, strict=True), strict=True)}

@@ -61,5 +61,5 @@ if (!window.playKeys) {
     event.preventDefault();
   });
 }
-// After the figures: they are drawn in the next frame.
-window.requestAnimationFrame(() => window.requestAnimationFrame(() => { wire.tags = [state.number, wire.tags[1] || null]; }));
+// The figures are drawn in the frame that comes; what is asked for a frame later comes behind them.
+window.requestAnimationFrame(() => window.setTimeout(() => { wire.tags = [state.number, wire.tags[1] || null]; }, 0));

@@ -42,11 +42,13 @@ from rcdsac_trl.robot.range_sensor import SENSORS
 _HERE = Path(__file__).parent
 _PERIOD_MS = 30
 # So many views may be under way to the browser; one that takes longer than this to be drawn is not waited for.
-_UNDER_WAY = 2
+_UNDER_WAY = 3
 _LONGEST_DRAWING_S = 2.0
 # An obstacle is put this far ahead of the first robot.
 _AHEAD_M = 1.2
 _RATE_S = 4.0
+# The critics' figures follow less often than the map: to draw axes takes a browser as long as everything else.
+_CRITICS_PERIOD_S = 0.35
 
 
 class PlayPage:
@@ -83,6 +85,7 @@ class PlayPage:
         self._film_told, self._film_files = "", list[str]()
         self._updating = False
         self._keys_heard = 0
+        self._critics_s = 0.0
         self._make_figures()
         self._make_widgets()
         self._compose()
@@ -102,7 +105,7 @@ class PlayPage:
         style = InlineStyleSheet(css=(_HERE / "widget.css").read_text("utf-8"))
 
         def made(kind: type, name: str, **given: Any) -> Any:
-            return kind(name=name, stylesheets=[style], **given)
+            return kind(name=name, stylesheets=[style], margin=0, **given)
 
         def button(name: str, label: str, click: Callable[[], None]) -> Button:
             widget = made(Button, name, label=label)
@@ -132,7 +135,7 @@ class PlayPage:
         self._stop.on_change(
             "active", self._by_hand(lambda on: self._drive(lambda c: c.tell(lambda d: d.set_stop_zone(on))))
         )
-        self._follow = made(Toggle, "follow", label="⌖ follow", active=False)
+        self._follow = made(Toggle, "follow", label="zoom in", active=False)
         self._follow.on_change("active", lambda attr, old, new: self._look_around())
         self._theme_toggle = made(Toggle, "theme", label="◐", active=False)
         self._theme_toggle.on_change("active", lambda attr, old, new: self._restyle("dark" if new else "light"))
@@ -182,9 +185,7 @@ class PlayPage:
             document.add_root(widget)
         document.title = "rcdsac_trl: play"
         document.template = (_HERE / "page.html").read_text("utf-8")
-        document.template_variables.update(
-            palettes=style_sheet(), page_css=(_HERE / "page.css").read_text("utf-8")
-        )
+        document.template_variables.update(palettes=style_sheet(), page_css=(_HERE / "page.css").read_text("utf-8"))
         document.js_on_event(
             DocumentReady,
             CustomJS(
@@ -260,10 +261,13 @@ class PlayPage:
         elif self._follow.active:
             self._look_around()
         self._show_obstacles(view.robots[0])
-        for robot, map_, curve, values in zip(view.robots, self._maps, self._curves, self._values, strict=False):
+        for robot, map_ in zip(view.robots, self._maps, strict=False):
             map_.copy(robot, colors)
-            curve.copy(robot.returns, colors)
-            values.copy(robot)
+        if (now_s := time.monotonic()) - self._critics_s > _CRITICS_PERIOD_S:
+            self._critics_s = now_s
+            for robot, curve, values in zip(view.robots, self._curves, self._values, strict=False):
+                curve.copy(robot.returns, colors)
+                values.copy(robot)
         self._update(self._pause, active=not view.running)
         self._pause.label = "❚❚ pause" if view.running else "▶ drive"
         self._wire.text = json.dumps(self._state(view))
@@ -403,7 +407,7 @@ class PlayPage:
                 slider.disabled = True
             else:
                 self._update(slider, start=dial.low, end=dial.high, value=robot.dialled, disabled=False)
-                slider.title = f"{dial.symbol} of {robot.name}, from careful to bold"
+                slider.title = f"{dial.symbol} of {robot.name}"
 
     def _look_around(self) -> None:
         if self._view is not None:

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 VALUES_A_SIDE = 11
 """The critics are asked for so many speeds, and for as many turning rates."""
-FINE = 4
+FINE = 6
 """Between two of them the picture has so many pixels; they are interpolated."""
 
 _FARTHEST_M = 3.0
