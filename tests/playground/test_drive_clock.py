@@ -5,10 +5,10 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from scenes_to_play import offers
 
 from rcdsac_trl.playground.drive_clock import DriveClock, View
 from rcdsac_trl.playground.scene_choice import SceneChoice
-from scenes_to_play import offers
 
 PATIENCE_S = 120.0
 CHOICE = SceneChoice("rcdsac_pow-narrow")

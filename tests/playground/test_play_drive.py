@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from robots import agent
 from scenes_to_play import drive, offers
 
 from rcdsac_trl.config.play_settings import PlaySettings
@@ -18,6 +17,7 @@ from rcdsac_trl.playground.play_drive import Drive
 from rcdsac_trl.playground.play_session import offers_of
 from rcdsac_trl.playground.scene_choice import SceneChoice
 from rcdsac_trl.world.maps.shapes import Box, Map
+from robots import agent
 
 STEPS = 25
 
@@ -94,8 +94,6 @@ def test_the_office_is_driven_by_cameras() -> None:
 
 
 def test_an_exported_agent_that_remembers_drives_by_the_name_of_its_folder(tmp_path: Any) -> None:
-    from rcdsac_trl.deploy.policy.weights import packed
-    from robots import agent
 
     folder = tmp_path / "mine"
     folder.mkdir()

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from scenes_to_play import drive
 
 from rcdsac_trl.agent.risk import MEASURES, CVaR, PowerLaw, make_measure
 from rcdsac_trl.playground.drivers import AgentDriver
@@ -20,7 +21,6 @@ from rcdsac_trl.playground.view_state import (
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.render import Scene
-from scenes_to_play import drive
 
 EMPTY = Map("clutter", 20.0, (), (), ())
 

@@ -62,18 +62,21 @@ class DriveClock:
         choice: the first scene.
         offers: what there is to choose from.
         ended: called, in that thread, when the physics is freed.
+        running: whether it drives at once, or waits to be told so.
 
     Attributes:
         newest: the latest view; None until the first scene stands.
         refused: why the first scene cannot be had; None: it can.
     """
 
-    def __init__(self, choice: SceneChoice, offers: Offers, ended: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, choice: SceneChoice, offers: Offers, ended: Callable[[], None] = lambda: None, running: bool = True
+    ) -> None:
         self.newest: View | None = None
         self.refused: str | None = None
         self._offers, self._ended = offers, ended
         self._orders: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._running, self._speed = True, 1.0
+        self._running, self._speed = running, 1.0
         self._message: str | None = None
         self._scene_number = 0
         self._due_s = 0.0

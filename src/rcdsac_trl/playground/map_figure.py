@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d, ScaleBar
-from bokeh.models.tools import PanTool, PointDrawTool, ResetTool, TapTool, WheelZoomTool
+from bokeh.models.tools import PanTool, PointDrawTool, ResetTool, WheelZoomTool
 from bokeh.palettes import Plasma256
 from bokeh.plotting import figure
 
@@ -69,7 +69,7 @@ class MapFigure:
             x_range=ranges.x,
             y_range=ranges.y,
             sizing_mode="stretch_both",
-            tools=[PanTool(), WheelZoomTool(), ResetTool(), TapTool()],
+            tools=[PanTool(), WheelZoomTool(), ResetTool()],
             toolbar_location="above",
             toolbar_inner=True,
             min_border=0,

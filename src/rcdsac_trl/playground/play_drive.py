@@ -114,6 +114,7 @@ class Drive:
             for name, driver, value in zip(names, drivers, dialled, strict=True):
                 driver.guarded = choice.stop
                 self.robots.append(Robot(name, driver, _arena(choice, driver, offers), value))
+            self.choice = choice.with_betas(dialled)
         except BaseException:
             self.close()
             raise

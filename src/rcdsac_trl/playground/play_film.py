@@ -3,6 +3,7 @@
 import itertools
 import threading
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.evaluation.film.episode_film import Track, film
@@ -10,7 +11,7 @@ from rcdsac_trl.evaluation.film.recording import Moment
 from rcdsac_trl.evaluation.film.video import check_extra, write_video
 from rcdsac_trl.playground.drive_clock import DriveClock
 
-SUFFIXES = (".mp4", ".gif")
+_FILMING = "filming .."
 
 
 class FilmStudio:
@@ -25,11 +26,11 @@ class FilmStudio:
         self._numbers = itertools.count(1)
         self._one_at_a_time = threading.Lock()
         self._made: dict[str, Path] = {}
-        self._states: dict[int, tuple[str, list[str]]] = {}
+        self._states: WeakKeyDictionary[DriveClock, tuple[str, list[str]]] = WeakKeyDictionary()
 
     def queue(self, clock: DriveClock | None) -> tuple[str, list[str]]:
         """Begin a film of the latest seconds of a drive, and say so; see :meth:`told`."""
-        if clock is None or self.told(clock)[0] == "filming ..":
+        if clock is None or self.told(clock)[0] == _FILMING:
             return self.told(clock)
         try:
             check_extra()
@@ -40,19 +41,19 @@ class FilmStudio:
                 target=self._make, args=[clock, tracks, headings, period_s], name="film", daemon=True
             ).start()
         )
-        return self._tell(clock, "filming ..")
+        return self._tell(clock, _FILMING)
 
     def told(self, clock: DriveClock | None) -> tuple[str, list[str]]:
         """Return a sentence about a drive's latest film, and the names of its files."""
-        return self._states.get(id(clock), ("", []))
+        return ("", []) if clock is None else self._states.get(clock, ("", []))
 
     def path(self, name: str) -> Path | None:
         """Return a film that was made here; None for every other name."""
         return self._made.get(name)
 
     def _tell(self, clock: DriveClock, sentence: str, files: list[str] | None = None) -> tuple[str, list[str]]:
-        self._states[id(clock)] = sentence, files or []
-        return self._states[id(clock)]
+        self._states[clock] = sentence, files or []
+        return self._states[clock]
 
     def _make(self, clock: DriveClock, tracks: list[list[Moment]], headings: list[str], period_s: float) -> None:
         with self._one_at_a_time:

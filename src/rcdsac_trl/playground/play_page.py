@@ -33,9 +33,9 @@ from rcdsac_trl.playground.critic_figures import ReturnFigure, ValueFigure
 from rcdsac_trl.playground.drive_clock import SPEEDS, DriveClock, View
 from rcdsac_trl.playground.map_figure import MapFigure, MapRanges
 from rcdsac_trl.playground.offers import Offers
-from rcdsac_trl.playground.palette import PALETTES, style_sheet
+from rcdsac_trl.playground.palette import PALETTES, THEMES, style_sheet
 from rcdsac_trl.playground.play_film import FilmStudio
-from rcdsac_trl.playground.scene_choice import AS_TRAINED, LARGEST_SEED, NOBODY, SceneChoice
+from rcdsac_trl.playground.scene_choice import AS_TRAINED, LARGEST_SEED, NOBODY, SceneChoice, shortened
 from rcdsac_trl.playground.view_state import RobotView
 from rcdsac_trl.robot.range_sensor import SENSORS
 
@@ -47,6 +47,8 @@ _LONGEST_DRAWING_S = 2.0
 # An obstacle is put this far ahead of the first robot.
 _AHEAD_M = 1.2
 _RATE_S = 4.0
+# What a link may say of the page itself.
+_OWN_KEYS: Mapping[str, tuple[str, ...]] = {"theme": THEMES, "paused": ("on", "off")}
 # The critics' figures follow less often than the map: to draw axes takes a browser as long as everything else.
 _CRITICS_PERIOD_S = 0.35
 
@@ -56,7 +58,8 @@ class PlayPage:
 
     Args:
         document: that becomes the page.
-        query: of the link, by key; `theme` is the page's own.
+        query: of the link, by key; beside a scene's keys it may hold ``theme`` (light or dark; else as the browser has
+            it) and ``paused`` (on or off).
         offers: what can be chosen.
         studio: makes films.
         admit: called before a drive begins; refuses where there are too many.
@@ -75,16 +78,17 @@ class PlayPage:
         self._document, self._offers, self._studio = document, offers, studio
         self._admit, self._gone = admit, gone
         self._query = dict(query)
+        self._own = {key: self._query.pop(key) for key in _OWN_KEYS if key in self._query}
         self._theme = "light"
         self._clock: DriveClock | None = None
         self._refused: str | None = None
         self._view: View | None = None
         self._scene_number = 0
-        self._sent: dict[int, float] = {}
+        self._sent: dict[int, tuple[float, int]] = {}  # when, and how many steps it shows
         self._drawn: deque[tuple[float, int]] = deque()
         self._film_told, self._film_files = "", list[str]()
         self._updating = False
-        self._keys_heard = 0
+        self._keys_heard = self._steps_drawn = 0
         self._critics_s = 0.0
         self._make_figures()
         self._make_widgets()
@@ -189,7 +193,7 @@ class PlayPage:
         document.js_on_event(
             DocumentReady,
             CustomJS(
-                args={"theme": self._theme_toggle, "asked": self._query.pop("theme", "")},
+                args={"theme": self._theme_toggle, "asked": self._own.get("theme", "")},
                 code=(
                     "const dark = window.matchMedia('(prefers-color-scheme: dark)').matches;"
                     "theme.active = asked ? asked === 'dark' : dark;"
@@ -206,13 +210,14 @@ class PlayPage:
         if self._clock is not None or self._refused is not None:
             return
         try:
+            _check_own(self._own)
             choice = SceneChoice.of_query(self._query, next(iter(self._offers.agents)))
             self._admit()
         except UserInputError as error:
             self._refused = str(error)
             self._show_refusal()
             return
-        self._clock = DriveClock(choice, self._offers, self._gone)
+        self._clock = DriveClock(choice, self._offers, self._gone, running=self._own.get("paused") != "on")
         self._document.add_periodic_callback(self._look, _PERIOD_MS)
 
     def close(self) -> None:
@@ -228,11 +233,11 @@ class PlayPage:
             self._refused = clock.refused
             self._show_refusal()
         view, now_s = clock.newest, time.monotonic()
-        self._sent = {number: at for number, at in self._sent.items() if now_s - at < _LONGEST_DRAWING_S}
+        self._sent = {number: sent for number, sent in self._sent.items() if now_s - sent[0] < _LONGEST_DRAWING_S}
         if view is None or view is self._view or len(self._sent) >= _UNDER_WAY or self._refused is not None:
             return
         self._view = view
-        self._sent[view.number] = now_s
+        self._sent[view.number] = now_s, view.robots[0].steps
         self._show(view)
 
     def _show_refusal(self) -> None:
@@ -299,9 +304,11 @@ class PlayPage:
     def _answered(self, attr: str, old: list[Any], new: list[Any]) -> None:
         """Hear what the browser says: which view it has drawn, which key was pressed."""
         number, key = [*new, None, None][:2]
-        if self._sent.pop(number, None) is not None and self._view is not None:
+        sent = self._sent.pop(number, None)
+        if sent is not None and sent[1] != self._steps_drawn and self._view is not None:
+            # One more step of every robot was seen, however many were left out before it.
+            self._steps_drawn = sent[1]
             now_s = time.monotonic()
-            # Of the views up to this one each was drawn, and each is a step of every robot.
             drawn = (self._drawn[-1][1] if self._drawn else 0) + len(self._view.robots)
             self._drawn.append((now_s, drawn))
             while now_s - self._drawn[0][0] > _RATE_S:
@@ -368,6 +375,9 @@ class PlayPage:
         if self._updating or self._view is None:
             return
         shown = self._view.robots[0].obstacles
+        if len(new["x"]) != len(shown):  # the tool deletes what is selected with Backspace
+            self._show_obstacles(self._view.robots[0])
+            return
         for number, (x, y, _) in enumerate(shown.tolist()):
             there = float(new["x"][number]), float(new["y"][number])
             if there != (x, y):
@@ -438,6 +448,12 @@ class PlayPage:
 
     def _told_film(self) -> None:
         self._film_told, self._film_files = self._studio.told(self._clock)
+
+
+def _check_own(keys: Mapping[str, str]) -> None:
+    for key, value in keys.items():
+        if value not in _OWN_KEYS[key]:
+            raise UserInputError(f"{key}={shortened(value)} is none of {', '.join(_OWN_KEYS[key])}: choose one of them")
 
 
 def _ahead(robot: RobotView) -> tuple[float, float]:

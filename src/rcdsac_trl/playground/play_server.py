@@ -1,8 +1,10 @@
 """The server: pages on one port, for who may look at them."""
 
+import queue
 import threading
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from bokeh.application import Application
@@ -82,13 +84,17 @@ class PlayServer:
         """How many robots, or pairs of them, drive now."""
         return self._driving
 
+    def start(self) -> None:
+        """Answer whoever asks, while the thread's event loop runs."""
+        self._server.start()
+
     def run(self, *, browser: bool) -> None:
         """Serve until Ctrl-C.
 
         Args:
             browser: open a page.
         """
-        self._server.start()
+        self.start()
         if browser:
             webbrowser.open(self.address)
         try:
@@ -97,10 +103,11 @@ class PlayServer:
             self.stop()
 
     def stop(self) -> None:
-        """End all drives."""
+        """Answer no more, and end all drives."""
         for page in self._pages:
             page.close()
         self._server.stop(wait=False)
+        self._server.http.stop()
 
     def _make_page(self, document: Document) -> None:
         context = document.session_context
@@ -131,6 +138,48 @@ class PlayServer:
             self._driving -= 1
 
 
+@contextmanager
+def in_thread(make: Callable[[], PlayServer]) -> Iterator[PlayServer]:
+    """Serve from a thread with an event loop of its own, as long as it is needed.
+
+    Args:
+        make: makes the server, in that thread.
+
+    Yields:
+        The server.
+    """
+    ready: queue.SimpleQueue[tuple[PlayServer, IOLoop] | BaseException] = queue.SimpleQueue()
+
+    def serve() -> None:
+        loop = IOLoop(make_current=False)
+        loop.add_callback(begin, loop)
+        loop.start()
+        loop.close()
+
+    def begin(loop: IOLoop) -> None:
+        try:
+            server = make()
+            server.start()
+        except BaseException as error:  # for who waits
+            ready.put(error)
+            loop.stop()
+        else:
+            ready.put((server, loop))
+
+    thread = threading.Thread(target=serve, name="play server", daemon=True)
+    thread.start()
+    made = ready.get()
+    if isinstance(made, BaseException):
+        raise made
+    server, loop = made
+    try:
+        yield server
+    finally:
+        loop.add_callback(server.stop)
+        loop.add_callback(loop.stop)
+        thread.join()
+
+
 class _FilmHandler(RequestHandler):
     """Hands out films by name."""
 
@@ -150,7 +199,6 @@ def what_it_means(host: str) -> str | None:
     if host in LOOPBACK:
         return None
     return (
-        f"host={host}: whoever reaches this machine there can open pages, without a password. They can drive the agents "
-        "and maps that are offered, which takes processor time, and fetch the films that were saved; no file is read "
-        "by a path of theirs"
+        f"host={host}: whoever reaches this machine there can open pages, without a password. They can drive what is "
+        "offered, which takes processor time, and fetch films that were saved; no file is read by a path of theirs"
     )
