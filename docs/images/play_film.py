@@ -29,21 +29,22 @@ STILL_STEP = 134
 SWITCHES = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
 
 
-def step(page: Page, number: int) -> None:
-    """Take the robots to a step, from the one before it."""
-    page.keyboard.press(".")
+def drive(page: Page, first: int, last: int) -> None:
+    """Take the robots from one step to another."""
+    for _ in range(first, last):
+        page.keyboard.press(".")
     page.wait_for_function(
         "(told) => document.querySelector('#robot0 [data-field=time]').textContent === told",
-        arg=f"{number * STEP_S:.1f} s",
+        arg=f"{last * STEP_S:.1f} s",
     )
 
 
 def frames(page: Page) -> Iterator[NDArray[np.uint8]]:
     """Yield pictures of the page."""
-    for number in range(1, LAST_STEP + 1):
-        step(page, number)
-        if number < FIRST_STEP or number % STEPS_A_FRAME:
-            continue
+    before = 0
+    for number in range(FIRST_STEP, LAST_STEP + 1, STEPS_A_FRAME):
+        drive(page, before, number)
+        before = number
         page.wait_for_timeout(500)  # the critics' figures follow the map
         shown = page.screenshot()
         if number == STILL_STEP:
@@ -64,6 +65,7 @@ def main() -> None:
             with sync_playwright() as playwright:
                 browser = playwright.chromium.launch(executable_path=chromium, args=SWITCHES)
                 page = browser.new_page(viewport=SIZE)
+                page.set_default_timeout(300_000)
                 page.goto(f"{address[0]}?{SCENE}&paused=on")
                 page.wait_for_function("document.querySelector('#robot1 [data-field=time]').textContent")
                 fps = 1.0 / (STEPS_A_FRAME * STEP_S)

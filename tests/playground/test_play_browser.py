@@ -105,27 +105,29 @@ def on_map(page: Page, x: float, y: float) -> dict[str, float]:
     return {"x": (x - low) / (high - low) * box["width"], "y": (top - y) / (top - bottom) * box["height"]}
 
 
-def goal(page: Page) -> list[float]:
-    """Return the place of the goal's mark, m: the last of the purple discs."""
-    return model(
-        page,
-        "map0",
-        "((data) => { const at = Array.from(data.get('fill'))"
-        f".lastIndexOf('{GOAL}');"
-        " return [data.get('x')[at], data.get('y')[at]]; })"
-        "(model.renderers.map((r) => r.data_source.data).find((d) => d.has('alpha') && d.has('radius')))",
+def filled(page: Page, color: str) -> list[list[float]]:
+    """Return the places of the round things of a colour that move or mark something, m."""
+    found: list[list[float]] = page.evaluate(
+        """(color) => {
+            const column = (data, key) => (data.get ? data.get(key) : data[key]) || [];
+            const places = [];
+            for (const { data_source } of Bokeh.documents[0].get_model_by_name("map0").renderers) {
+                const [x, y, fill] = ["x", "y", "fill"].map((key) => column(data_source.data, key));
+                Array.from(fill).forEach((each, at) => each === color && x.length && places.push([x[at], y[at]]));
+            }
+            return places;
+        }""",
+        color,
     )
+    return found
+
+
+def goal(page: Page) -> list[float]:
+    return filled(page, GOAL)[-1]
 
 
 def obstacles(page: Page) -> list[list[float]]:
-    """Return the places of the obstacles that were put, m."""
-    found: list[list[float]] = model(
-        page,
-        "map0",
-        "((data) => data ? Array.from(data.get('x')).map((x, at) => [x, data.get('y')[at]]) : [])"
-        f"(model.renderers.map((r) => r.data_source.data).find((d) => (d.get('fill') || [])[0] === '{OBSTACLE}'))",
-    )
-    return found
+    return filled(page, OBSTACLE)
 
 
 def picture(page: Page, name: str, tmp_path: Path) -> None:

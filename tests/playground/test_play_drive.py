@@ -13,6 +13,7 @@ from rcdsac_trl.config.play_settings import PlaySettings
 from rcdsac_trl.deploy import Command
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.playground.drivers import AgentDriver
 from rcdsac_trl.playground.play_drive import Drive
 from rcdsac_trl.playground.play_session import offers_of
 from rcdsac_trl.playground.scene_choice import SceneChoice
@@ -82,6 +83,20 @@ def test_beta_is_turned_while_it_drives() -> None:
             turned.step()
         assert way(turned)[:16] == way(kept)[:16]
         assert way(turned) != way(kept)
+
+
+def test_who_is_asked_with_another_beta_reconsiders_what_it_wants_and_expects() -> None:
+    with driven(beta="-2") as scene:
+        (robot,) = scene.robots
+        driver, before = robot.driver, robot.command
+        assert isinstance(driver, AgentDriver)
+        assert before is not None
+        told = driver.policy.foresee(0.0)
+        scene.set_beta(0, 0.0)
+        assert robot.command is not None
+        assert robot.command.wanted == told.wanted != before.wanted
+        assert robot.command.value == told.value != before.value
+        assert robot.command.v_m_per_s == before.v_m_per_s
 
 
 def test_the_office_is_driven_by_cameras() -> None:

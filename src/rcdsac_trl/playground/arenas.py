@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,11 @@ class Arena(Protocol):
     map: Map
     robot: RobotSettings
     period_s: float
-    simulation: Simulation
+
+    @property
+    def simulation(self) -> Simulation:
+        """The physics."""
+        ...
 
     def situation(self) -> Situation:
         """Return what the robot is asked on."""
@@ -218,7 +222,7 @@ class CourseArena:
     robot = PAPER
     period_s = 0.15
 
-    def __init__(self, office: Office, config: TaskSettings, seed: int) -> None:
+    def __init__(self, office: Office, config: Any, seed: int) -> None:
         self.map = office.map
         self._office, self._config = office, config
         conditions = Conditions(Lens(), OdometrySettings(), math.inf, seed)

@@ -14,6 +14,7 @@ Colors = Mapping[str, str]
 
 _STEP = 5.0
 _HEAVIEST = 4.0
+_BAR_PX = 54
 
 
 class ReturnFigure:
@@ -131,6 +132,7 @@ class ValueFigure:
         )
         self._bar = ColorBar(color_mapper=self._mapper, width=8, padding=4, title=None, background_fill_alpha=0.0)
         plot.add_layout(self._bar, "right")
+        plot.min_border_right = _BAR_PX  # its labels change, and it is laid out once
         self._shown: ValueView | None = None
 
     def restyle(self, colors: Colors) -> None:

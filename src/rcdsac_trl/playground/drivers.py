@@ -92,6 +92,10 @@ class Driver(Protocol):
         """Return the command for this control period."""
         ...
 
+    def reconsidered(self, command: Command, dialled: float | None) -> Command:
+        """Return the last command as it would have been with another beta; the wheels were told what they were told."""
+        ...
+
 
 class AgentDriver:
     """A trained agent.
@@ -142,9 +146,17 @@ class AgentDriver:
 
     def act(self, situation: Situation, dialled: float | None) -> Command:
         """Return the agent's command."""
-        weighted = self.policy.config.context == "collision_weight"
-        told = {"collision_weight": dialled} if weighted else {"beta": dialled}
-        return self.policy.act(situation.sectors, situation.waypoints, situation.velocity, **told)
+        is_weight = self.policy.config.context == "collision_weight"
+        beta, weight = (None, dialled) if is_weight else (dialled, None)
+        sectors, waypoints, velocity = situation.sectors, situation.waypoints, situation.velocity
+        return self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight)
+
+    def reconsidered(self, command: Command, dialled: float | None) -> Command:
+        """Return a command with what the agent would want with another beta, and what it expects of that."""
+        if self.policy.config.context != "beta":
+            return command
+        outlook = self.policy.foresee(dialled)
+        return replace(command, wanted=outlook.wanted, quantiles=outlook.quantiles, value=outlook.value)
 
 
 class PlannerDriver:
@@ -187,3 +199,7 @@ class PlannerDriver:
             return Command(*wanted, False, None, wanted, fresh=True)
         v, omega, reason = self._guard.limit(*wanted, situation.sectors, situation.velocity)
         return Command(v, omega, False, reason, wanted, fresh=True)
+
+    def reconsidered(self, command: Command, dialled: float | None) -> Command:
+        """Return the command: a planner has no beta."""
+        return command

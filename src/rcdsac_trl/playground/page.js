@@ -41,8 +41,8 @@ if (film.dataset.shown !== JSON.stringify(state.film)) {
 if (!state.refused && window.location.search !== "?" + state.query)
   window.history.replaceState(null, "", "?" + state.query);
 
-if (!window.playKeys) {
-  window.playKeys = true;
+if (window.playKeys === undefined) {
+  window.playKeys = 0;
   window.addEventListener("keydown", (event) => {
     const at = event.composedPath()[0];
     const writes = at instanceof HTMLInputElement || at instanceof HTMLSelectElement;
@@ -56,7 +56,8 @@ if (!window.playKeys) {
         slider.value = Math.min(slider.end, Math.max(slider.start, slider.value + turned * span / 20));
       }
     } else if ([" ", ".", "o", "a", "d"].includes(event.key.toLowerCase())) {
-      wire.tags = [wire.tags[0] || 0, [event.key.toLowerCase(), Date.now()]];
+      window.playKeys += 1;
+      wire.tags = [wire.tags[0] || 0, [event.key.toLowerCase(), window.playKeys]];
     } else return;
     event.preventDefault();
   });

@@ -141,6 +141,8 @@ class Drive:
         if robot.driver.dial is None:
             raise UserInputError(f"{robot.name} has no beta: choose an agent that is risk-conditioned")
         robot.dialled = robot.driver.dial.check("beta" if number == 0 else "beta2", value)
+        if robot.command is not None:
+            robot.command = robot.driver.reconsidered(robot.command, robot.dialled)
         self.choice = self.choice.with_betas([robot.dialled for robot in self.robots])
 
     def set_stop_zone(self, on: bool) -> None:

@@ -70,9 +70,9 @@ class PlayServer:
             check_unused_sessions_milliseconds=_CHECK_UNUSED_MS,
             websocket_max_message_size_bytes=_LARGEST_MESSAGE_BYTES,
         )
-        http = HTTPServer(pages)
-        http.add_sockets(sockets)
-        self._server = BaseServer(IOLoop.current(), pages, http)
+        self._http = HTTPServer(pages)
+        self._http.add_sockets(sockets)
+        self._server = BaseServer(IOLoop.current(), pages, self._http)
 
     @property
     def address(self) -> str:
@@ -104,10 +104,10 @@ class PlayServer:
 
     def stop(self) -> None:
         """Answer no more, and end all drives."""
+        self._http.stop()
         for page in self._pages:
             page.close()
         self._server.stop(wait=False)
-        self._server.http.stop()
 
     def _make_page(self, document: Document) -> None:
         context = document.session_context
