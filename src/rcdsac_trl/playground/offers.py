@@ -48,7 +48,9 @@ class Offers:
             UserInputError: for an agent or a file that cannot be read, and a name that stands for two.
         """
         agents: dict[str, str] = {}
-        for run in (*runs, *shipped_names()):
+        # Who has no beta to be turned comes last.
+        shipped = sorted(shipped_names(), key=lambda name: _read(name).config.context != "beta")
+        for run in (*runs, *shipped):
             find_agent(run)
             name = Path(run).resolve().name if Path(run).is_dir() else run
             if name in agents or name in PLANNERS:
