@@ -22,7 +22,7 @@ from rcdsac_trl.evaluation.film.video import write_video
 HERE = Path(__file__).parent
 SCENE = "agent=rcdsac_pow-narrow&beta=-2&second=rcdsac_pow-narrow&beta2=0&map=hard&seed=3"
 SIZE = {"width": 1280, "height": 800}
-# The neutral robot touches something in step 134.
+# The neutral robot touches something in step 135.
 FIRST_STEP, LAST_STEP, STEPS_A_FRAME = 92, 150, 2
 STEP_S = 0.12
 STILL_STEP = 134

@@ -169,8 +169,8 @@ class PlannerDriver:
         seed: root seed of what it draws.
     """
 
-    dial = None
-    measure = None
+    dial: Dial | None = None
+    measure: RiskMeasure | None = None
     memory_s = 0.0
 
     def __init__(self, name: str, robot: RobotSettings, sensor: str, seed: int) -> None:

@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,7 @@ class PlayPage:
         self._maps = [MapFigure(self._ranges, self._obstacles, f"map{number}") for number in (0, 1)]
         self._curves = [ReturnFigure(f"curve{number}") for number in (0, 1)]
         self._values = [ValueFigure(f"values{number}") for number in (0, 1)]
+        self._plots: list[MapFigure | ReturnFigure | ValueFigure] = [*self._maps, *self._curves, *self._values]
         for map_ in self._maps:
             map_.figure.on_event(Tap, self._tapped)
 
@@ -130,7 +132,7 @@ class PlayPage:
             for number in (0, 1)
         ]
         for number, slider in enumerate(self._betas):
-            slider.on_change("value", self._by_hand(lambda value, number=number: self._tell_beta(number, value)))
+            slider.on_change("value", self._by_hand(partial(self._tell_beta, number)))
         self._pause = made(Toggle, "pause", label="❚❚ pause", active=False)
         self._pause.on_change("active", self._by_hand(lambda on: self._drive(lambda clock: clock.run(not on))))
         self._speed = made(RadioButtonGroup, "speed", labels=["½×", "1×", "2×", "4×"], active=SPEEDS.index(1.0))
@@ -153,7 +155,7 @@ class PlayPage:
             "seed": made(Spinner, "seed", title="seed", low=0, high=LARGEST_SEED, step=1, value=0, width=90),
         }
         for key, widget in self._selects.items():
-            widget.on_change("value", self._by_hand(lambda value, key=key: self._choose(**{key: value})))
+            widget.on_change("value", self._by_hand(partial(self._choose_one, key)))
         self._wire = Div(name="wire", text="", visible=False, tags=[])
         self._wire.js_on_change(
             "text",
@@ -183,7 +185,7 @@ class PlayPage:
 
     def _compose(self) -> None:
         document = self._document
-        for plot in (*self._maps, *self._curves, *self._values):
+        for plot in self._plots:
             document.add_root(plot.figure)
         for widget in self._widgets:
             document.add_root(widget)
@@ -381,9 +383,13 @@ class PlayPage:
         for number, (x, y, _) in enumerate(shown.tolist()):
             there = float(new["x"][number]), float(new["y"][number])
             if there != (x, y):
-                self._drive(
-                    lambda clock, number=number, there=there: clock.tell(lambda d: d.move_obstacle(number, *there))
-                )
+                self._move_obstacle(number, *there)
+
+    def _move_obstacle(self, number: int, x: float, y: float) -> None:
+        self._drive(lambda clock: clock.tell(lambda drive: drive.move_obstacle(number, x, y)))
+
+    def _choose_one(self, key: str, value: Any) -> None:
+        self._choose(**{key: value})
 
     def _choose(self, **changes: Any) -> None:
         """Open another scene; betas go with who they belong to."""
@@ -427,7 +433,7 @@ class PlayPage:
     def _restyle(self, theme: str) -> None:
         self._theme = theme
         colors = PALETTES[theme]
-        for plot in (*self._maps, *self._curves, *self._values):
+        for plot in self._plots:
             plot.restyle(colors)
         self._scene_number = 0  # what stands is drawn anew with the next view
         if self._refused is not None:
