@@ -93,8 +93,9 @@ def test_only_films_that_were_made_can_be_fetched(server: PlayServer, tmp_path: 
     (tmp_path / "films").mkdir()
     (tmp_path / "secret").write_text("secret")
     (tmp_path / "films" / "play-1.gif").write_text("of another server")
-    with pytest.raises(urllib.error.HTTPError, match="404"):
+    with pytest.raises(urllib.error.HTTPError, match="404") as refused:
         _get(server, f"/films/{name}")
+    refused.value.close()
 
 
 def test_a_port_that_is_taken_is_refused(tmp_path: Path) -> None:

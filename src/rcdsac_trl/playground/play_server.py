@@ -1,6 +1,7 @@
 """The server: pages on one port, for who may look at them."""
 
 import queue
+import socket
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
@@ -56,6 +57,9 @@ class PlayServer:
         self._driving = 0
         self._lock = threading.Lock()
         try:
+            if port:  # Tornado leaves sockets open that it could not bind
+                family = socket.AF_INET6 if ":" in host else socket.AF_INET
+                socket.create_server((host, port), family=family).close()
             sockets, self.port = bind_sockets(host, port)
         except OSError as error:
             raise UserInputError(
