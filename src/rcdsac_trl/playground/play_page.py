@@ -418,6 +418,7 @@ class PlayPage:
         self._update(self._stop, active=choice.stop)
         for slider, robot in zip(self._betas, view.robots, strict=False):
             dial = robot.dial
+            slider.show_value = dial is not None
             if dial is None:
                 slider.title = f"{robot.name} has no β"
                 slider.disabled = True
