@@ -13,7 +13,7 @@ BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job 
 WORKERS ?= logical
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup train smoke test test-slow check format bench notebooks clean
+.PHONY: setup train smoke play test test-slow chromium check format bench notebooks clean
 
 train: setup
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
@@ -21,8 +21,20 @@ train: setup
 smoke: setup
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow preset=smoke
 
-test: setup
+# A page on which a robot drives while you turn beta; Ctrl-C ends it.
+play: setup
+	$(BIN)/python -m rcdsac_trl.play
+
+test: setup chromium
 	$(PYTEST)
+
+# Tests of the page open it in the system's Chromium. Where that is missing and may not be installed, they skip.
+chromium:
+	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit 0; done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get -qq update && \
+	  DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends chromium >/dev/null; then exit 0; fi; \
+	echo "There is no Chromium, and it could not be installed from here: tests of the page in a browser will skip."; \
+	echo "To run them too: sudo apt-get install chromium"
 
 # One after another: they start clusters of their own, and count on the cores.
 test-slow: test

@@ -107,6 +107,7 @@ def test_there_are_commands_of_every_verb() -> None:
         "course",
         "publish",
         "replay",
+        "play",
     }
 
 
@@ -118,7 +119,7 @@ def test_links_lead_somewhere(name: str, target: str) -> None:
 
 def test_named_files_exist() -> None:
     for name, path in texts(
-        r"`((?:system|robot|world|agent|deploy|config|storage|rollout|release|training|evaluation|experiments|report|tests|conf|docs)/[\w/.*-]+)`"
+        r"`((?:system|robot|world|agent|deploy|config|storage|rollout|release|training|evaluation|experiments|playground|report|tests|conf|docs)/[\w/.*-]+)`"
     ):
         places = (ROOT, ROOT / "src" / "rcdsac_trl")
         exists = any(list(place.glob(path.rstrip("/"))) for place in places)

@@ -61,7 +61,7 @@ def is_entry_point(module: str) -> bool:
 # From above to below: a room imports what stands below it. World, agent and deploy stand side by side; of them only
 # deploy may use another, the agent's layers, which it exports.
 FLOORS = (
-    {"experiments"},
+    {"experiments", "playground"},
     {"evaluation"},
     {"training"},
     {"release"},
@@ -131,7 +131,7 @@ def test_reports_are_written_without_torch(module: str) -> None:
 
 
 # Beside config/, these write a run's config down or are given a composed one to make something of.
-READ_THE_CONFIG = ("config", "training", "evaluation", "release", "experiments")
+READ_THE_CONFIG = ("config", "training", "evaluation", "release", "experiments", "playground")
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -248,6 +248,7 @@ def test_every_key_of_the_configuration_is_explained() -> None:
         "calibrate.yaml",
         "course.yaml",
         "replay.yaml",
+        "play.yaml",
         "report.yaml",
         "draw_maps.yaml",
         "plot_training.yaml",

@@ -74,7 +74,7 @@ def test_the_wheel_holds_the_configuration_and_no_leftovers(installed: Path) -> 
     assert files_below(installed / "rcdsac_trl" / "conf") == files_below(ROOT / "conf")
     names = list(files_below(installed))
     assert {name.split("/")[0] for name in names if ".dist-info" not in name} == {"rcdsac_trl"}
-    kinds = {".py", ".yaml", ".typed", ".csv", ".json", ".safetensors", ".md"}
+    kinds = {".py", ".yaml", ".typed", ".csv", ".json", ".safetensors", ".md", ".html", ".css", ".js"}
     assert {Path(name).suffix for name in names if name.startswith("rcdsac_trl/")} == kinds
     assert "rcdsac_trl/report/paper.csv" in names
 

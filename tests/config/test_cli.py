@@ -228,12 +228,17 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
 @pytest.mark.parametrize(
     ("verb", "given", "key"),
     [
-        *((verb, "run=", "run") for verb in ("evaluate", "calibrate", "course", "export", "plot_training", "replay")),
+        *(
+            (verb, "run=", "run")
+            for verb in ("evaluate", "calibrate", "course", "export", "play", "plot_training", "replay")
+        ),
         *(
             (verb, "out=", "out")
             for verb in ("evaluate", "calibrate", "course", "export", "report", "draw_maps", "replay")
         ),
         ("plot_training", "out='  '", "out"),
+        ("play", "films=", "films"),
+        ("play", "maps=[a.yaml,'']", "maps"),
         ("course", "run=[sac-narrow,'']", "run"),
         ("report", "runs=['']", "runs"),
         ("publish", "runs=['']", "runs"),

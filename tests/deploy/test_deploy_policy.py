@@ -108,6 +108,28 @@ def test_it_foresees_what_it_would_do_and_expect_at_another_beta() -> None:
     assert kept.foresee(-2.0).value == commands[0].value != policies[0].foresee(-2.0).value
 
 
+@pytest.mark.parametrize("row", ROWS)
+def test_many_actions_at_once_are_expected_what_each_is_alone(row: str) -> None:
+    policy = Policy(agent(**ROWS[row]))
+    policy.act(OPEN, AHEAD, STANDING)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2)).astype(np.float32)
+    many = policy.outlooks(actions)
+    if row == "rcwr":  # foresee() does not answer for a weight that may be another one
+        assert many.shape == (7, 1)
+        return
+    for expected, action in zip(many, actions, strict=True):
+        alone = policy.foresee(action=action)
+        assert expected.mean() == pytest.approx(alone.value, abs=1e-5)
+        if alone.quantiles is not None:
+            assert expected == pytest.approx(alone.quantiles, abs=1e-5)
+    assert len(np.unique(many.mean(axis=1))) == 7
+
+
+def test_nothing_is_expected_of_actions_before_anything_was_seen() -> None:
+    with pytest.raises(UserInputError, match="nothing was seen"):
+        Policy(agent()).outlooks(np.zeros((1, 2), np.float32))
+
+
 @pytest.mark.parametrize(
     ("row", "arguments", "reason"),
     [

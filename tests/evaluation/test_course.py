@@ -24,6 +24,7 @@ from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.course_drive import (
     Conditions,
+    CourseWorld,
     Direction,
     Trace,
     course_of,
@@ -114,6 +115,19 @@ def test_the_pilot_is_told_what_sensors_say_and_nothing_else() -> None:
         assert seen_at == pytest.approx(course[1])
     assert not np.allclose(trace.estimates[-1], trace.poses[-1], atol=1e-4)
     assert trace.poses[-1, 0] > trace.poses[0, 0] + 0.4
+
+
+def test_cameras_and_physics_know_an_obstacle_that_is_put_into_the_office() -> None:
+    with contextlib.closing(CourseWorld(OFFICE, PursuitPilot().config, "forward", 0, SHORT, [(0.3, 1.0)])) as world:
+        x, y, yaw = world.simulation.pose
+        assert world.seen().distances_m[0] > 1.3
+        world.put_disc(x + 1.0 * math.cos(yaw), y + 1.0 * math.sin(yaw))
+        assert world.seen().distances_m[0] == pytest.approx(0.7, abs=0.06)
+        world.simulation.move_disc(0, x + 1.5 * math.cos(yaw), y + 1.5 * math.sin(yaw))
+        assert world.seen().distances_m[0] == pytest.approx(1.2, abs=0.08)
+        with pytest.raises(UserInputError, match="all 1 spare obstacles of the office are in use"):
+            world.put_disc(x, y)
+        assert any(world.step(0.6, 0.0).in_contact for _ in range(30))
 
 
 def test_a_run_repeats_bit_by_bit_and_repetitions_differ() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world.maps.generator import Map, MapSettings
 from rcdsac_trl.world.sim.simulation import StepResult
 from rcdsac_trl.world.task import episode as core
@@ -302,3 +303,46 @@ def test_an_agent_that_was_never_reset_says_so() -> None:
     with pytest.raises(UserInputError, match="reset"):
         group.scene(0)
     group.close()
+
+
+def agent_on_a_map() -> core.NavigationAgent:
+    agent = core.NavigationAgent(MapSettings(), TaskSettings(), sensor_mask("full"), "evaluation", 0)
+    agent.reset(0, 0)
+    return agent
+
+
+def test_a_goal_that_is_set_is_planned_to_and_the_next_is_drawn_from_there() -> None:
+    agent = agent_on_a_map()
+    drawn = agent.scene().waypoints[-1]
+    x, y = agent.set_goal(-3.0, 25.0)  # outside of the map: the nearest place at its edge counts
+    assert 0.0 < x < 20.0
+    assert 0.0 < y < 20.0
+    assert agent.simulation.room_at(x, y, 1.0) >= 0.3 - 1e-9  # the robot, and the planner's margin
+    assert agent.scene().waypoints[-1].tolist() == [x, y] != drawn.tolist()
+    agent.place((x, y, 0.0))
+    agent.step((0.0, 0.0))
+    assert agent.goal_reached
+    assert agent.scene().waypoints[-1].tolist() != [x, y]
+    agent.close()
+
+
+def test_who_is_placed_elsewhere_sees_from_there_and_plans_anew_to_its_goal() -> None:
+    agent = agent_on_a_map()
+    goal, seen = agent.scene().waypoints[-1], agent.distances_m
+    near = goal + np.array([0.3, 0.0])
+    agent.place((*near.tolist(), 1.0))
+    assert agent.pose == pytest.approx((*near, 1.0))
+    assert agent.velocities == (0.0, 0.0, 0.0, 0.0)
+    assert agent.scene().waypoints.tolist() == [goal.tolist()]
+    assert not np.array_equal(agent.distances_m, seen)
+    agent.close()
+
+
+def test_a_disc_that_is_put_is_seen_before_the_next_step() -> None:
+    agent = agent_on_a_map()
+    x, y, yaw = agent.pose
+    number = agent.put_disc(x + 0.8 * math.cos(yaw), y + 0.8 * math.sin(yaw), 0.3)
+    assert agent.distances_m[0] == pytest.approx(0.5, abs=1e-3)
+    agent.move_disc(number, x + 0.9 * math.cos(yaw), y + 0.9 * math.sin(yaw))
+    assert agent.distances_m[0] == pytest.approx(0.6, abs=1e-3)
+    agent.close()

@@ -465,3 +465,55 @@ def test_of_a_large_map_only_what_is_near_exists_and_nothing_else_changes(monkey
     assert near == whole
     assert max(few_bodies) < 0.7 * min(all_bodies)
     assert len(set(few_bodies)) > 3  # they came and went
+
+
+# What somebody does to the world while it runs
+
+
+def test_a_disc_that_is_put_is_sensed_and_touched_and_moved_and_forgotten_with_the_next_load(simulation):
+    load(simulation, room(movers=[Mover(0.25, 0.3)]), (3.0, 4.0, 0.0))
+    movers = simulation.mover_positions
+    assert simulation.put_disc(5.0, 4.0, 0.3) == 0
+    assert simulation.put_disc(3.0, 6.0, 0.2) == 1
+    assert simulation.scan()[0] == pytest.approx(5.0 - 3.0 - 0.3)
+    assert simulation.room_at(3.0, 5.0, 2.0) == pytest.approx(0.8)
+    assert simulation.put_discs.tolist() == [[5.0, 4.0, 0.3], [3.0, 6.0, 0.2]]
+    assert np.array_equal(simulation.mover_positions, movers)  # they are other rows
+    results = [simulation.step(0.6, 0.0, 7) for _ in range(40)]
+    assert results[-1].in_contact
+    # Its flat side meets the disc.
+    assert simulation.pose[0] == pytest.approx(5.0 - 0.3 - APOTHEM_M, abs=2e-3)
+    simulation.move_disc(0, 5.5, 4.0)
+    assert simulation.scan()[0] == pytest.approx(5.5 - simulation.pose[0] - 0.3)
+    for _ in range(40):
+        simulation.step(0.6, 0.0, 7)
+    assert simulation.pose[0] == pytest.approx(5.5 - 0.3 - APOTHEM_M, abs=2e-3)
+    load(simulation, room(), (3.0, 4.0, 0.0))
+    assert not len(simulation.put_discs)
+    assert simulation.scan()[0] == math.inf
+
+
+def test_movers_walk_where_they_would_whatever_is_put(simulation):
+    walks = []
+    for put in (False, True):
+        load(simulation, room(movers=[Mover(0.25, 0.5), Mover(0.2, 0.6)]), (1.0, 1.0, 0.0))
+        if put:
+            simulation.put_disc(4.0, 4.0, 0.3)
+        for _ in range(50):
+            simulation.step(0.0, 0.0, 7)
+        walks.append(simulation.mover_positions)
+    assert np.array_equal(*walks)
+
+
+def test_a_robot_that_is_placed_stands_there_at_rest_and_without_contact(simulation):
+    load(simulation, room(), (7.0, 4.0, 0.0))
+    for _ in range(20):
+        simulation.step(0.6, 0.0, 7)
+    assert simulation.step(0.6, 0.0, 7).in_contact
+    simulation.place((2.0, 3.0, 4.0))
+    assert simulation.pose == pytest.approx((2.0, 3.0, 4.0 - 2.0 * math.pi))
+    result = simulation.step(0.6, 0.0, 7)
+    assert not result.in_contact
+    assert result.v_c == pytest.approx(0.21, abs=1e-12)
+    driven = 0.0168
+    assert result.pose[:2] == pytest.approx((2.0 + driven * math.cos(4.0), 3.0 + driven * math.sin(4.0)), abs=1e-9)

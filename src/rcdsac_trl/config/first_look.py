@@ -16,6 +16,7 @@ from rcdsac_trl.config.evaluation_settings import (
     PublishSettings,
 )
 from rcdsac_trl.config.named_folder import default_training, find_agent
+from rcdsac_trl.config.play_settings import PlaySettings
 from rcdsac_trl.config.replay_settings import ReplaySettings
 from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.deploy import find_weights
@@ -90,6 +91,18 @@ def look_at_publication(cfg: DictConfig) -> None:
         agent_of_run(Path(run))
     for folder in (settings.weights, settings.results):
         check_writable(Path(folder))
+
+
+def look_at_play(cfg: DictConfig) -> None:
+    """Refuse settings and agents that `play` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, PlaySettings)
+    for run in settings.runs:
+        find_agent(run)
+    check_writable(Path(settings.films))
 
 
 def look_at_replay(cfg: DictConfig) -> None:

@@ -51,10 +51,10 @@ def look_ahead(foreseen: NDArray[np.float32], action: NDArray[np.float32]) -> ND
     Args:
         foreseen: [n >= 44], last of it what is foreseen; see
             :meth:`~rcdsac_trl.robot.foreseen_clearance.ForeseenClearance.nearness`.
-        action: u, [2], in [-1, 1].
+        action: u, [..., 2], in [-1, 1].
 
     Returns:
-        float32 [2]: soon, and later.
+        float32 [..., 2]: soon, and later.
 
     Example:
         >>> foreseen = np.zeros(44, np.float32)
@@ -62,7 +62,7 @@ def look_ahead(foreseen: NDArray[np.float32], action: NDArray[np.float32]) -> ND
         >>> look_ahead(foreseen, np.array([1.0, 0.125], np.float32)).tolist()  # half of it, half of what lies beside
         [0.25, 0.5]
     """
-    rising, falling = HAT_SLOPES * action[:, None] + HAT_OFFSETS
-    first, second = np.minimum(rising, falling).clip(0.0, 1.0)
-    told: NDArray[np.float32] = foreseen[-FORESEEN_SIZE:].reshape(NUM_LOOK_AHEAD, -1) @ (first * second)
+    sides = HAT_SLOPES * action[..., None, :, None] + HAT_OFFSETS
+    hats = sides.min(axis=-3).clip(0.0, 1.0)
+    told: NDArray[np.float32] = hats.prod(axis=-2) @ foreseen[-FORESEEN_SIZE:].reshape(NUM_LOOK_AHEAD, -1).T
     return told

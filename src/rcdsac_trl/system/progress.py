@@ -21,7 +21,7 @@ Watch = Callable[[int], None]
 """Is told, again and again, how many steps are done so far."""
 Part = TypeVar("Part")
 
-_under_way: list["Work"] = []
+_under_way: list["Work | _Service"] = []
 
 
 class Work:
@@ -100,6 +100,24 @@ class Work:
             print(f"rcdsac_trl: {self}{'' if how_long is None else f' ({how_long})'}", file=sys.stderr)
         else:
             self._bar.set_postfix_str(str(self))
+
+
+class _Service:
+    """What nobody waits for."""
+
+    def tell(self, how_long: str) -> None:
+        """Say nothing."""
+
+
+@contextmanager
+def serving() -> Iterator[None]:
+    """Let a program be silent that serves until somebody ends it."""
+    service = _Service()
+    _under_way.append(service)
+    try:
+        yield
+    finally:
+        _under_way.remove(service)
 
 
 @contextmanager

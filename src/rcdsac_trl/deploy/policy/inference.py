@@ -218,21 +218,32 @@ class Critics:
             action: u, [2].
             embedded: ``beta`` in [0, 1]; None where the networks read none.
         """
-        told = np.concatenate((action, look_ahead(read[0], action))) if self._looks_ahead else action
-        size = read.shape[1]
-        joined = np.empty((len(read), 1, size + len(told)), dtype=np.float32)
-        joined[:, 0, :size], joined[:, 0, size:] = read, told
+        return self.of_actions(read, action[None], embedded)[0]
+
+    def of_actions(self, read: Array, actions: Array, embedded: float | None) -> Array:
+        """Return what :meth:`values` says of each of several actions, [K, N], or [K, 1] of scalar critics.
+
+        Args:
+            read: of each critic, [C, n].
+            actions: [K, 2].
+            embedded: ``beta`` in [0, 1]; None where the networks read none.
+        """
+        told = np.concatenate((actions, look_ahead(read[0], actions)), axis=1) if self._looks_ahead else actions
+        critics, size = read.shape
+        joined = np.empty((critics, len(told), size + told.shape[1]), dtype=np.float32)
+        joined[:, :, :size], joined[:, :, size:] = read[:, None], told
         x = _rectified(joined, self._input)
         if self._gate is not None:
             gate = self._gate
             if self._beta is not None and embedded is not None:
                 gate = gate + _cosines(embedded, self._angles) @ self._beta
-            x = x * np.maximum(gate, _ZERO)
+            gated = x[:, :, None] * np.maximum(gate, _ZERO)[:, None]
+            x = gated.reshape(critics, -1, gated.shape[-1])
         weight, bias = self._output
         values = _rectified(x, self._hidden) @ weight
         values += bias
         # Networks may cross their quantiles a little; in rising order they are never farther from the true ones.
-        return np.minimum.reduce(np.sort(values, axis=1))[:, 0]
+        return np.minimum.reduce(np.sort(values.reshape(critics, len(told), -1), axis=2))
 
 
 def _rectified(x: Array, layer: tuple[Array, Array]) -> Array:

@@ -186,6 +186,27 @@ class Policy:
             raise UserInputError(f"action={action} is not two numbers from -1 to 1: give u_0 and u_1")
         return self._outlook(embedded, asked)
 
+    def outlooks(self, actions: NDArray[np.float32], beta: float | None = None) -> NDArray[np.float32]:
+        """Return what the critics expect of many actions where the agent stands now, as :meth:`foresee` of each.
+
+        Unlike that it also takes an agent that is told a collision weight: it answers for the one of the last
+        :meth:`act`.
+
+        Args:
+            actions: [K, 2], each number in [-1, 1].
+            beta: how much risk to take; None: :attr:`default_beta`.
+
+        Returns:
+            Quantiles of the return at :attr:`fractions`, float32 [K, N]; of critics that know the mean alone, [K, 1].
+
+        Raises:
+            UserInputError: if nothing was seen since :meth:`reset`, or `beta` is refused by :meth:`act`, too.
+        """
+        if self._steps == 0:
+            raise UserInputError("nothing was seen since the memory was cleared: call act() first")
+        embedded = self._embedded(self.check_beta(beta))
+        return self._critics.of_actions(self._read[1:], np.asarray(actions, np.float32), embedded)
+
     def check_beta(self, beta: float | None) -> float | None:
         """Return what the agent is told for a `beta`, None where that is nothing.
 

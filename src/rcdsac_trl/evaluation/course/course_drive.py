@@ -3,7 +3,7 @@
 import contextlib
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -14,12 +14,14 @@ from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.camera_rig import camera_poses, mounted, sectors_of_clouds
 from rcdsac_trl.evaluation.course.odometry import Odometry, Pose
+from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.office.building import PERSON_HEIGHT_M, Office
 from rcdsac_trl.world.office.depth_cameras import DepthCameras, Lens
-from rcdsac_trl.world.sim.simulation import Simulation
+from rcdsac_trl.world.sim.simulation import Simulation, StepResult
 from rcdsac_trl.world.task.rules import collision_due
 
 Direction = Literal["forward", "reverse"]
@@ -27,6 +29,8 @@ DIRECTIONS: tuple[Direction, ...] = ("forward", "reverse")
 
 # In motor steps of 0.02 s it is 7.5: a command takes effect at the next one, so it lasts 7 or 8 of them.
 _MOTOR_STEPS_OF_TWO = 15
+# Outside of everything: there are the cylinders that nobody has put anywhere yet.
+_NOWHERE_M = -100.0
 
 
 class Pilot(Protocol):
@@ -106,6 +110,90 @@ def motor_steps(step: int) -> int:
     return (step + 1) * _MOTOR_STEPS_OF_TWO // 2 - step * _MOTOR_STEPS_OF_TWO // 2
 
 
+class CourseWorld:
+    """The office and a robot in it at the beginning of the course, to be driven step by step.
+
+    Args:
+        office: where.
+        config: of who drives: its waypoint and goal radii.
+        direction: forward or in reverse.
+        repetition: number of the run.
+        conditions: of all runs.
+        spare_discs: radius and height, m, of cylinders that can be put somewhere later; see :meth:`put_disc`.
+
+    Attributes:
+        simulation: the physics.
+        odometry: where the robot takes itself to be.
+        follower: of the path, the course unless somebody sets another one.
+        velocity: measured last, m/s and rad/s.
+        steps: taken so far.
+    """
+
+    def __init__(
+        self,
+        office: Office,
+        config: Any,
+        direction: Direction,
+        repetition: int,
+        conditions: Conditions,
+        spare_discs: Sequence[tuple[float, float]] = (),
+    ) -> None:
+        index = (DIRECTIONS.index(direction), repetition)
+        course = course_of(office, direction)
+        pose = start_pose(course)
+        self.odometry = Odometry(conditions.odometry, pose, stream(conditions.seed, "course/odometry", *index))
+        self.follower = PathFollower(course, config)
+        self._poses = camera_poses(conditions.camera.view_deg)
+        self._spare_discs = tuple(spare_discs)
+        self.simulation = Simulation()
+        self._cameras = DepthCameras(
+            conditions.camera,
+            [mounted(camera) for camera in self._poses],
+            office.solids,
+            [*((mover.radius, PERSON_HEIGHT_M) for mover in office.map.movers), *self._spare_discs],
+            stream(conditions.seed, "course/cameras", *index),
+        )
+        self.simulation.load(office.map, office.planner, pose, stream(conditions.seed, "course/people", *index))
+        self.velocity = self.odometry.velocity(0.0, 0.0)
+        self.steps = 0
+
+    def waypoints(self) -> NDArray[np.float64] | None:
+        """Return the next two waypoints, m, in the frame of where the robot takes itself to be; None at the goal."""
+        return self.follower.update(self.odometry.pose)
+
+    def seen(self) -> Sectors:
+        """Return what the cameras say now."""
+        put_xy = np.full((len(self._spare_discs), 2), _NOWHERE_M)
+        put = self.simulation.put_discs
+        put_xy[: len(put)] = put[:, :2]
+        moving = np.concatenate([self.simulation.mover_positions, put_xy])
+        return sectors_of_clouds(self._cameras.clouds(self.simulation.pose, moving), self._poses)
+
+    def step(self, v: float, omega: float) -> StepResult:
+        """Let the robot do what it is told, m/s and rad/s, for a control period."""
+        moved = self.simulation.step(v, omega, motor_steps(self.steps))
+        self.steps += 1
+        self.odometry.move(moved.pose, PERIOD_S)
+        self.velocity = self.odometry.velocity(moved.v_c, moved.omega_c)
+        return moved
+
+    def put_disc(self, x: float, y: float) -> int:
+        """Put the next spare cylinder somewhere, m; return its number, from 0, for ``simulation.move_disc``.
+
+        Raises:
+            UserInputError: if there is none left.
+        """
+        put = len(self.simulation.put_discs)
+        if put == len(self._spare_discs):
+            raise UserInputError(f"all {put} spare obstacles of the office are in use: move one of them")
+        return self.simulation.put_disc(x, y, self._spare_discs[put][0])
+
+    def close(self) -> None:
+        """Disconnect from PyBullet; harmless when done before."""
+        self._cameras.close()
+        self.simulation.close()
+
+
 def drive_course(
     office: Office,
     pilot: Pilot,
@@ -129,46 +217,25 @@ def drive_course(
         conditions: of all runs.
         before_step: called before each command.
     """
-    index = (DIRECTIONS.index(direction), repetition)
-    course = course_of(office, direction)
-    pose = start_pose(course)
-    odometry = Odometry(conditions.odometry, pose, stream(conditions.seed, "course/odometry", *index))
-    follower = PathFollower(course, pilot.config)
-    poses = camera_poses(conditions.camera.view_deg)
-    with (
-        contextlib.closing(Simulation()) as simulation,
-        contextlib.closing(
-            DepthCameras(
-                conditions.camera,
-                [mounted(camera) for camera in poses],
-                office.solids,
-                [(mover.radius, PERSON_HEIGHT_M) for mover in office.map.movers],
-                stream(conditions.seed, "course/cameras", *index),
-            )
-        ) as cameras,
-    ):
-        simulation.load(office.map, office.planner, pose, stream(conditions.seed, "course/people", *index))
+    with contextlib.closing(CourseWorld(office, pilot.config, direction, repetition, conditions)) as world:
         pilot.reset()
-        states = [_state(simulation, odometry, False)]
+        states = [_state(world, False)]
         steps: list[dict[str, Any]] = []
-        velocity = odometry.velocity(0.0, 0.0)
-        while (waypoints := follower.update(odometry.pose)) is not None:
+        while (waypoints := world.waypoints()) is not None:
             now_s = len(steps) * PERIOD_S
             if now_s + PERIOD_S > conditions.time_limit_s:
                 break
             before_step()
-            seen = sectors_of_clouds(cameras.clouds(simulation.pose, simulation.mover_positions), poses)
+            seen, velocity = world.seen(), world.velocity
             stamps = Stamps(now_s, now_s, now_s, now_s)
             command = pilot.act(seen, waypoints, velocity, beta, stamps=stamps)
             commanded = (command.v_m_per_s, command.omega_rad_per_s)
-            moved = simulation.step(*commanded, motor_steps(len(steps)))
+            moved = world.step(*commanded)
             step = {"distances_m": seen.distances_m, "velocities": velocity, "commands": commanded}
             limited = not command.stopped and command.reason is not None
             steps.append(step | {"stopped": command.stopped, "limited": limited})
-            odometry.move(moved.pose, PERIOD_S)
-            velocity = odometry.velocity(moved.v_c, moved.omega_c)
-            states.append(_state(simulation, odometry, moved.in_contact))
-    return Trace(bool(follower.reached), **_columns(states), **_columns(steps))
+            states.append(_state(world, moved.in_contact))
+        return Trace(bool(world.follower.reached), **_columns(states), **_columns(steps))
 
 
 def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int | bool]:
@@ -200,13 +267,13 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
     }
 
 
-def _state(simulation: Simulation, odometry: Odometry, in_contact: bool) -> dict[str, Any]:
+def _state(world: CourseWorld, in_contact: bool) -> dict[str, Any]:
     return {
-        "poses": simulation.pose,
-        "estimates": odometry.pose,
-        "people": simulation.mover_positions,
+        "poses": world.simulation.pose,
+        "estimates": world.odometry.pose,
+        "people": world.simulation.mover_positions,
         "in_contact": in_contact,
-        "nearest_m": simulation.scan().min(),
+        "nearest_m": world.simulation.scan().min(),
     }
 
 

@@ -63,7 +63,7 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
                 "robot=paper"
             )
         policy.guard = None if settings.guard_margin_m is None else Guard(margin_m=settings.guard_margin_m)
-        _check_sensor(run, policy, settings.camera.view_deg)
+        check_sensor(run, policy, settings.camera.view_deg)
     conditioned = [run for run, policy in policies.items() if policy.config.context == "beta"]
     if settings.beta is not None and not conditioned:
         raise UserInputError(f"beta={list(settings.beta)} means nothing to who drives: leave it out")
@@ -89,8 +89,12 @@ def _of_policy(run: str, policy: Policy, betas: Sequence[float] | None) -> list[
     return [Entry(run, config.name, beta, beta, policy) for beta in betas]
 
 
-def _check_sensor(run: str, policy: Policy, view_deg: float) -> None:
-    """Refuse an agent that the cameras leave in the dark; its policy would only stand."""
+def check_sensor(run: str, policy: Policy, view_deg: float) -> None:
+    """Refuse an agent that the cameras leave in the dark; its policy would only stand.
+
+    Raises:
+        UserInputError: naming the share of its sectors that they cover.
+    """
     mask = policy.config.sensor_mask
     lost = np.count_nonzero(mask & ~covered(camera_poses(view_deg))) / np.count_nonzero(mask)
     if lost > InputLimits().max_lost_share:

@@ -193,6 +193,15 @@ class Planner:
                 return goal
         raise UserInputError(f"no goal lies {min_path_m:g} m of path away; lower min_path_m or choose a larger map")
 
+    def nearest_free(self, point: Point) -> NDArray[np.float64]:
+        """Return the place [2], m, nearest to a point of which :meth:`sample_free` draws: a goal for who asks for it.
+
+        Args:
+            point: anywhere, m; outside of the map, the nearest place at its edge counts.
+        """
+        inside = np.clip(np.asarray(point, np.float64), 0.0, self.map.size_m)
+        return self._true.centre(np.array(self._true.nearest(inside)))
+
     def true_path(self, start_xy: Point, goal_xy: Point) -> NDArray[np.float64]:
         """Return the robot's shortest path past everything that stands, mapped or not."""
         return self._true.path(start_xy, goal_xy)

@@ -159,16 +159,11 @@ class Simulation:
             physicsClientId=client,
         )
         pybullet.setGravity(0.0, 0.0, 0.0, physicsClientId=client)
-        visual = -1 if self._gui else bodies.invisible_shape(client)
+        visual = self._visual = -1 if self._gui else bodies.invisible_shape(client)
         self._static = bodies.StaticBodies(client, map, visual, whole=True if self._gui else None)
         self._static.follow(*start_pose[:2])
         self._robot = bodies.add_robot(client, start_pose, visual, self.robot)
-        x, y, yaw = start_pose
-        self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
-        self._v_c = self._omega_c = self._clearance_m = 0.0
-        self._driven = (0.0, 0.0)
-        self._touch = None
-        self._in_contact = False
+        self._rest_at(start_pose)
         movers = self._movers = Movers(
             map, planner, start_pose[:2], movers_rng, self.robot.motor_period_s, self.robot.circumradius_m
         )
@@ -177,11 +172,89 @@ class Simulation:
         )
         self._segments = NearSegments(map.segments(), self.robot.lidar.max_range_m)
         self._boxes, static = map.solids()
-        # The last rows are the movers' own, so that they are sensed where they walk.
-        self._circles = np.concatenate([static, movers.discs])
-        movers.discs = self._circles[len(static) :]
+        self._put_bodies: list[int] = []
+        self._sense_circles(static)
         if self._gui:
             bodies.look_from_above(client, map)
+
+    def _rest_at(self, pose: tuple[float, float, float]) -> None:
+        """Take down that the robot stands somewhere, and touches nothing."""
+        x, y, yaw = pose
+        self._pose = (float(x), float(y), math.remainder(yaw, 2.0 * math.pi))
+        self._v_c = self._omega_c = self._clearance_m = 0.0
+        self._driven = (0.0, 0.0)
+        self._touch = None
+        self._in_contact = False
+
+    def _sense_circles(self, standing: NDArray[np.float64]) -> None:
+        """Let the scan see circles that stand, float64 [n, 3], and all movers."""
+        # The last rows are the movers' own, so that they are sensed where they walk.
+        self._circles = np.concatenate([standing, self._movers.discs])
+        self._movers.discs = self._circles[len(standing) :]
+
+    def place(self, pose: tuple[float, float, float]) -> None:
+        """Put the robot somewhere else, at rest and without contact.
+
+        Args:
+            pose: x, y in m and yaw in rad, map frame; where the robot overlaps something, physics drives them apart.
+        """
+        self._rest_at(pose)
+        x, y, yaw = self._pose
+        turn = (0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0))
+        pybullet.resetBasePositionAndOrientation(self._robot, (x, y, 0.0), turn, self._client)
+        pybullet.resetBaseVelocity(self._robot, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), self._client)
+
+    def put_disc(self, x: float, y: float, radius_m: float) -> int:
+        """Put an upright cylinder among what stands; it is gone with the next load.
+
+        It is sensed and touched like everything else. Movers do not know it: their walks were planned without it, and
+        they walk through it.
+
+        Args:
+            x: centre, map frame, m.
+            y: likewise.
+            radius_m: radius.
+
+        Returns:
+            Its number, from 0, for :meth:`move_disc`.
+        """
+        disc = np.array([[x, y, radius_m]])
+        self._put_bodies += bodies.add_movers(self._client, disc, self._visual)
+        self._sense_circles(np.concatenate([self._circles[: self._num_standing], disc]))
+        self._clearance_m = 0.0  # not known until the next scan
+        return len(self._put_bodies) - 1
+
+    def move_disc(self, number: int, x: float, y: float) -> None:
+        """Move a cylinder that was put.
+
+        Args:
+            number: as :meth:`put_disc` returned it.
+            x: its new centre, map frame, m.
+            y: likewise.
+        """
+        self._circles[self._num_standing - len(self._put_bodies) + number, :2] = x, y
+        pybullet.resetBasePositionAndOrientation(self._put_bodies[number], (x, y, 0.0), _UPRIGHT, self._client)
+        self._clearance_m = 0.0  # not known until the next scan
+
+    @property
+    def put_discs(self) -> NDArray[np.float64]:
+        """Centre and radius of each cylinder that was put, float64 [n, 3], m; a copy."""
+        return self._circles[self._num_standing - len(self._put_bodies) : self._num_standing].copy()
+
+    @property
+    def _num_standing(self) -> int:
+        """Rows of the circles before the movers' own."""
+        return len(self._circles) - len(self._movers.discs)
+
+    def room_at(self, x: float, y: float, limit_m: float) -> float:
+        """Return how far a place is from the nearest thing, movers among them, m, at most a limit.
+
+        Args:
+            x: of the place, map frame, m.
+            y: likewise.
+            limit_m: what is farther is not looked for.
+        """
+        return float(segment_clearance(x, y, x, y, self._boxes, self._circles, limit_m))
 
     @property
     def pose(self) -> tuple[float, float, float]:

@@ -172,7 +172,49 @@ class NavigationAgent:
             self._take_waypoints()
         v_c, omega_c = rules.noisy_velocities(moved.v_c, moved.omega_c, disturbances.odometry_noise_std, self._noise)
         self.velocities = (v_c, omega_c, v_u, omega_u)
-        self._sense(elapsed_s=self._motor_steps * self._robot.motor_period_s)
+        self._sense(elapsed_s=self.period_s)
+
+    def set_goal(self, x: float, y: float) -> Point:
+        """Give the robot another goal; those that follow are drawn relative to it.
+
+        Args:
+            x: where it should be, map frame, m.
+            y: likewise.
+
+        Returns:
+            Where it is: the nearest place that the robot can get to.
+        """
+        self._head_for(self._planner.nearest_free((x, y)))
+        return self._goal
+
+    def place(self, pose: Pose) -> None:
+        """Put the robot somewhere else, at rest, with a new plan to its goal. What it remembers moves with it.
+
+        Args:
+            pose: x, y in m and yaw in rad, map frame.
+        """
+        self.simulation.place(pose)
+        self.pose = self.simulation.pose
+        self.velocities = (0.0, 0.0, 0.0, 0.0)
+        self.in_contact = False
+        self._head_for(self._goal)
+        self._scan()
+
+    def put_disc(self, x: float, y: float, radius_m: float) -> int:
+        """Put a cylinder that the planner does not know; see :meth:`.Simulation.put_disc`."""
+        number = self.simulation.put_disc(x, y, radius_m)
+        self._scan()
+        return number
+
+    def move_disc(self, number: int, x: float, y: float) -> None:
+        """Move a cylinder that was put; see :meth:`.Simulation.move_disc`."""
+        self.simulation.move_disc(number, x, y)
+        self._scan()
+
+    @property
+    def period_s(self) -> float:
+        """Duration of an agent step of this episode, s."""
+        return self._motor_steps * self._robot.motor_period_s
 
     def _guarded(self, v_u: float, omega_u: float) -> tuple[float, float]:
         """Return what a stop zone leaves of desired velocities; the robot is told that it wanted these."""
@@ -246,6 +288,10 @@ class NavigationAgent:
             rng = self._stream("goal", self._goals_drawn)
             goal = self._planner.sample_goal(rng, self._goal, self._task.min_path_m)
         self._goals_drawn += 1
+        self._head_for(goal)
+
+    def _head_for(self, goal: Point | NDArray[np.float64]) -> None:
+        """Plan to a goal from where the robot is."""
         # As plain floats: single numbers out of arrays are slow, and every step reads some.
         self._path = [(x, y) for x, y in self._planner.waypoints(self.pose[:2], goal).tolist()]
         self._goal = self._path[-1]
@@ -271,10 +317,13 @@ class NavigationAgent:
 
     def _sense(self, elapsed_s: float) -> None:
         self._trail.append(self.pose[:2])
-        noise = self._disturbances
-        distances = self.simulation.scan()
-        self.distances_m = rules.noisy_ranges(distances, noise.range_noise_std_m, noise.range_dropout, self._noise)
+        self._scan()
         self._pose_error.step(elapsed_s)
         v_c, omega_c, _, _ = self.velocities
         memory = self._memory
         self.remembered = None if memory is None else memory.observe(self.distances_m, v_c, omega_c, elapsed_s)
+
+    def _scan(self) -> None:
+        noise = self._disturbances
+        distances = self.simulation.scan()
+        self.distances_m = rules.noisy_ranges(distances, noise.range_noise_std_m, noise.range_dropout, self._noise)

@@ -1,0 +1,205 @@
+"""Who drives a robot on the page: a trained agent, or a classical planner with the same inputs."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.agent.risk import RiskMeasure, make_measure
+from rcdsac_trl.deploy import Command, Guard, Policy, Sectors, Weights
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import RobotSettings
+from rcdsac_trl.rollout.planners.controller import Controller
+from rcdsac_trl.rollout.planners.dwa import Dwa
+from rcdsac_trl.rollout.planners.mppi import Mppi
+from rcdsac_trl.seeding import stream
+
+NUM_QUANTILES = 16
+"""At so many fractions the page shows the return."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a robot is asked on.
+
+    Attributes:
+        sectors: what its range sensor says, all of it.
+        waypoints: the next two, m, in its frame, [2, 2].
+        velocity: linear and angular velocity measured, m/s and rad/s.
+        desired: those it was told last.
+    """
+
+    sectors: Sectors
+    waypoints: NDArray[np.float64]
+    velocity: tuple[float, float]
+    desired: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Dial:
+    """What turns a driver.
+
+    Attributes:
+        symbol: what it is called.
+        low: its smallest value, for beta the most averse one.
+        high: its largest.
+        default: where it stands unless somebody turns it.
+    """
+
+    symbol: str
+    low: float
+    high: float
+    default: float
+
+    def check(self, key: str, value: float | None) -> float:
+        """Return a value that may be dialled; None: the default.
+
+        Raises:
+            UserInputError: if it is outside the trained range.
+        """
+        if value is None:
+            return self.default
+        if not self.low <= value <= self.high:
+            raise UserInputError(
+                f"{key}={value:g} is outside [{self.low:g}, {self.high:g}], where this agent was trained: "
+                "choose a value of that range"
+            )
+        return value
+
+
+class Driver(Protocol):
+    """Drives one robot."""
+
+    robot: RobotSettings
+    sensor: str
+    memory_s: float
+    dial: Dial | None
+    measure: RiskMeasure | None
+    """What weighs the return; None where its distribution is not known."""
+    guarded: bool
+    """Whether the stop zone is on."""
+
+    def beta(self, dialled: float | None) -> float | None:
+        """Return the beta by which the measure weighs the return; None where there is none."""
+        ...
+
+    def reset(self) -> None:
+        """Begin anew."""
+        ...
+
+    def act(self, situation: Situation, dialled: float | None) -> Command:
+        """Return the command for this control period."""
+        ...
+
+    def reconsidered(self, command: Command, dialled: float | None) -> Command:
+        """Return the last command as it would have been with another beta; the wheels were told what they were told."""
+        ...
+
+
+class AgentDriver:
+    """A trained agent.
+
+    Args:
+        weights: of the agent.
+        sensor: that it sees with; None: what it was trained with.
+
+    Attributes:
+        policy: that acts.
+        fixed_beta: the one beta that it was trained for; None for a range, or none.
+    """
+
+    def __init__(self, weights: Weights, sensor: str | None = None) -> None:
+        if sensor is not None:
+            weights = replace(weights, config=replace(weights.config, sensor=sensor))
+        config = weights.config
+        self.policy = Policy(weights, guard=None, num_quantiles=NUM_QUANTILES)
+        self.robot, self.sensor, self.memory_s = config.robot, config.sensor, config.memory_s
+        self.fixed_beta = config.fixed_beta
+        self.measure = make_measure(config.measure) if config.critic == "quantile" else None
+        self.dial: Dial | None = None
+        if config.context is not None and config.context_range is not None:
+            low, high = config.context_range
+            symbol = "β" if config.context == "beta" else "w"
+            self.dial = Dial(symbol, low, high, (low + high) / 2.0)
+
+    @property
+    def guarded(self) -> bool:
+        """Whether the stop zone is on."""
+        return self.policy.guard is not None
+
+    @guarded.setter
+    def guarded(self, on: bool) -> None:
+        self.policy.guard = Guard.of(self.robot) if on else None
+
+    def beta(self, dialled: float | None) -> float | None:
+        """Return the beta by which the measure weighs the return: as dialled, or the one of the training."""
+        if self.policy.config.context == "beta":
+            return dialled
+        if self.fixed_beta is not None or self.measure is None:
+            return self.fixed_beta
+        return self.measure.neutral_beta
+
+    def reset(self) -> None:
+        """Forget everything before."""
+        self.policy.reset()
+
+    def act(self, situation: Situation, dialled: float | None) -> Command:
+        """Return the agent's command."""
+        is_weight = self.policy.config.context == "collision_weight"
+        beta, weight = (None, dialled) if is_weight else (dialled, None)
+        sectors, waypoints, velocity = situation.sectors, situation.waypoints, situation.velocity
+        return self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight)
+
+    def reconsidered(self, command: Command, dialled: float | None) -> Command:
+        """Return a command with what the agent would want with another beta, and what it expects of that."""
+        if self.policy.config.context != "beta":
+            return command
+        outlook = self.policy.foresee(dialled)
+        return replace(command, wanted=outlook.wanted, quantiles=outlook.quantiles, value=outlook.value)
+
+
+class PlannerDriver:
+    """A classical planner.
+
+    Args:
+        name: one of :data:`~rcdsac_trl.playground.offers.PLANNERS`.
+        robot: that it drives.
+        sensor: that it sees with.
+        seed: root seed of what it draws.
+    """
+
+    dial: Dial | None = None
+    measure: RiskMeasure | None = None
+    memory_s = 0.0
+
+    def __init__(self, name: str, robot: RobotSettings, sensor: str, seed: int) -> None:
+        self.robot, self.sensor = robot, sensor
+        self.guarded = False
+        self._name, self._seed = name, seed
+        self._mask = robot.sensor_mask(sensor)
+        self._guard = Guard.of(robot)
+        self._controller: Controller = Dwa(robot=robot) if name == "dwa" else Mppi(robot=robot)
+        self.reset()
+
+    def beta(self, dialled: float | None) -> float | None:
+        """Return None: it knows no return."""
+        return None
+
+    def reset(self) -> None:
+        """Forget everything before, its local map too."""
+        self._controller.reset(self._mask, stream(self._seed, self._name, 0, 0))
+
+    def act(self, situation: Situation, dialled: float | None) -> Command:
+        """Return the planner's command."""
+        ranges_m = np.where(self._mask, situation.sectors.distances_m, np.inf)
+        velocities = np.array([*situation.velocity, *situation.desired])
+        wanted = self._controller.act(ranges_m, situation.waypoints, velocities)
+        if not self.guarded:
+            return Command(*wanted, False, None, wanted, fresh=True)
+        v, omega, reason = self._guard.limit(*wanted, situation.sectors, situation.velocity)
+        return Command(v, omega, False, reason, wanted, fresh=True)
+
+    def reconsidered(self, command: Command, dialled: float | None) -> Command:
+        """Return the command: a planner has no beta."""
+        return command

@@ -1,0 +1,66 @@
+// What the page does by itself: it writes numbers down, tells the server what was shown, and hears keys.
+// `wire` carries the newest state as JSON and, back, the number of the view that was drawn last; see play_page.py.
+const state = JSON.parse(wire.text);
+const put = (element, text) => { if (element && element.textContent !== text) element.textContent = text; };
+
+document.documentElement.dataset.theme = state.theme;
+document.body.classList.toggle("two", state.robots.length === 2);
+put(document.getElementById("message"), state.message || "");
+put(document.getElementById("rate"), state.rate);
+put(document.getElementById("scene-told"), state.scene);
+const sentence = document.getElementById("sentence");
+sentence.hidden = !state.refused;
+for (const id of ["bar", "scene", "stage"]) document.getElementById(id).hidden = Boolean(state.refused);
+document.querySelector("footer").hidden = Boolean(state.refused);
+if (state.refused && !sentence.textContent) {
+  sentence.textContent = state.refused + " ";
+  const link = document.createElement("a");
+  link.href = window.location.pathname;
+  link.textContent = "Open the usual scene.";
+  sentence.append(link);
+}
+state.robots.forEach((robot, number) => {
+  const section = document.getElementById("robot" + number);
+  for (const field of section.querySelectorAll("[data-field]")) put(field, robot[field.dataset.field]);
+  section.classList.toggle("blind", robot.blind);
+  section.classList.toggle("deaf", robot.deaf);
+  section.querySelector(".alarm").classList.toggle("hit", robot.touching);
+});
+const film = document.getElementById("film");
+if (film.dataset.shown !== JSON.stringify(state.film)) {
+  film.dataset.shown = JSON.stringify(state.film);
+  film.textContent = state.film.told;
+  for (const name of state.film.files) {
+    const link = document.createElement("a");
+    link.href = "films/" + name;
+    link.download = name;
+    link.textContent = name.split(".").pop().toUpperCase();
+    film.append(" ", link);
+  }
+}
+if (!state.refused && window.location.search !== "?" + state.query)
+  window.history.replaceState(null, "", "?" + state.query);
+
+if (window.playKeys === undefined) {
+  window.playKeys = 0;
+  window.addEventListener("keydown", (event) => {
+    const at = event.composedPath()[0];
+    const writes = at instanceof HTMLInputElement || at instanceof HTMLSelectElement;
+    if (writes || (at.classList && at.classList.contains("noUi-handle") && event.key.startsWith("Arrow"))) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const turned = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (turned) {
+      const slider = event.shiftKey ? beta1 : beta0;
+      if (!slider.disabled) {
+        const span = slider.end - slider.start;
+        slider.value = Math.min(slider.end, Math.max(slider.start, slider.value + turned * span / 20));
+      }
+    } else if ([" ", ".", "o", "a", "d"].includes(event.key.toLowerCase())) {
+      window.playKeys += 1;
+      wire.tags = [wire.tags[0] || 0, [event.key.toLowerCase(), window.playKeys]];
+    } else return;
+    event.preventDefault();
+  });
+}
+// The figures are drawn in the frame that comes; what is asked for a frame later comes behind them.
+window.requestAnimationFrame(() => window.setTimeout(() => { wire.tags = [state.number, wire.tags[1] || null]; }, 0));

@@ -1,0 +1,239 @@
+"""The drive that a page shows: one robot or two, each in a world of its own of the same map and seed.
+
+Nothing here knows of a browser: it is stepped, and told what to do.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from rcdsac_trl.deploy import Command
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation.course.entries import check_sensor
+from rcdsac_trl.playground.arenas import MOST_OBSTACLES, Arena, CourseArena, MapArena
+from rcdsac_trl.playground.drivers import AgentDriver, Driver, PlannerDriver
+from rcdsac_trl.playground.offers import OFFICE, PLANNERS, Offers
+from rcdsac_trl.playground.scene_choice import AS_TRAINED, NOBODY, SceneChoice, shortened
+from rcdsac_trl.robot.range_sensor import SENSORS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.world.office.building import make_office
+from rcdsac_trl.world.office.depth_cameras import Lens
+from rcdsac_trl.world.task.rules import TaskSettings
+
+NARROW = "narrow"
+"""The sensor of planners, and of the office's cameras."""
+TRAIL_STEPS = 400
+"""So many steps of its way are kept of a robot."""
+
+
+@dataclass
+class Robot:
+    """One robot: its world, who drives it, and what came of it.
+
+    Attributes:
+        name: who drives.
+        driver: likewise.
+        arena: its world.
+        dialled: beta, or the collision weight; None where there is neither.
+        command: the last one; None before the first step.
+        steps: taken so far.
+        reward: so far; None where nothing is paid.
+        collisions: contacts begun so far.
+        goals: reached so far.
+        contacts: where contacts began, x and y, m.
+        in_contact: whether it touches something.
+        trail: where it was and how fast, x and y in m and m/s, the latest steps.
+    """
+
+    name: str
+    driver: Driver
+    arena: Arena
+    dialled: float | None
+    command: Command | None = None
+    steps: int = 0
+    reward: float | None = None
+    collisions: int = 0
+    goals: int = 0
+    contacts: list[tuple[float, float]] = field(default_factory=list)
+    in_contact: bool = False
+    trail: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL_STEPS))
+
+    def __post_init__(self) -> None:
+        """Begin the trail where the robot starts."""
+        x, y, _ = self.arena.simulation.pose
+        self.trail.append((x, y, 0.0))
+
+    @property
+    def time_s(self) -> float:
+        """How long it has driven."""
+        return self.steps * self.arena.period_s
+
+    def step(self) -> None:
+        """Take one agent step."""
+        command = self.driver.act(self.arena.situation(), self.dialled)
+        outcome = self.arena.step(command.v_m_per_s, command.omega_rad_per_s)
+        self.command = command
+        self.steps += 1
+        x, y, _ = self.arena.simulation.pose
+        self.trail.append((x, y, outcome.speed_m_per_s))
+        if outcome.reward is not None:
+            self.reward = outcome.reward + (self.reward or 0.0)
+        if outcome.in_contact and not self.in_contact:
+            self.collisions += 1
+            self.contacts.append((x, y))
+        self.in_contact = outcome.in_contact
+        self.goals += outcome.goal_reached
+
+
+class Drive:
+    """All robots of a scene, stepped together.
+
+    Args:
+        choice: the scene.
+        offers: what there is to choose from.
+
+    Attributes:
+        choice: the scene, with the betas that are dialled now.
+        robots: one or two.
+        num_obstacles: that were put.
+
+    Raises:
+        UserInputError: for what is not offered, a beta outside of the trained range, a sensor that does not exist, and
+            two robots that do not fit the same map.
+    """
+
+    def __init__(self, choice: SceneChoice, offers: Offers) -> None:
+        self.choice = choice
+        self.num_obstacles = 0
+        names = [choice.agent] + ([] if choice.second == NOBODY else [choice.second])
+        drivers = _drivers(names, choice, offers)
+        betas = [("beta", choice.beta), ("beta2", choice.beta2)]
+        dialled = [_dialled(driver, *beta) for driver, beta in zip(drivers, betas, strict=False)]
+        self.robots: list[Robot] = []
+        try:
+            for name, driver, value in zip(names, drivers, dialled, strict=True):
+                driver.guarded = choice.stop
+                self.robots.append(Robot(name, driver, _arena(choice, driver, offers), value))
+            self.choice = choice.with_betas(dialled)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def period_s(self) -> float:
+        """Duration of a step."""
+        return self.robots[0].arena.period_s
+
+    def step(self) -> None:
+        """Take one agent step with every robot."""
+        for robot in self.robots:
+            robot.step()
+
+    def set_beta(self, number: int, value: float) -> None:
+        """Turn a robot's beta, or collision weight.
+
+        Raises:
+            UserInputError: if it is outside the trained range, or that robot has none.
+        """
+        if number >= len(self.robots):
+            raise UserInputError("there is no second robot: choose who drives it")
+        robot = self.robots[number]
+        if robot.driver.dial is None:
+            raise UserInputError(f"{robot.name} has no beta: choose an agent that is risk-conditioned")
+        robot.dialled = robot.driver.dial.check("beta" if number == 0 else "beta2", value)
+        if robot.command is not None:
+            robot.command = robot.driver.reconsidered(robot.command, robot.dialled)
+        self.choice = self.choice.with_betas([robot.dialled for robot in self.robots])
+
+    def set_stop_zone(self, on: bool) -> None:
+        """Put a stop zone between all drivers and their wheels, or take it away."""
+        for robot in self.robots:
+            robot.driver.guarded = on
+
+    def set_goal(self, x: float, y: float) -> None:
+        """Send all robots to the place nearest to a point, m, that they can get to."""
+        self._each(lambda arena: arena.set_goal(x, y))
+
+    def put_obstacle(self, x: float, y: float) -> None:
+        """Put an obstacle into every world.
+
+        Raises:
+            UserInputError: if there are too many, or it cannot stand there.
+        """
+        if self.num_obstacles == MOST_OBSTACLES:
+            raise UserInputError(f"{MOST_OBSTACLES} obstacles are there already: drag one of them")
+        for robot in self.robots:
+            robot.arena.check_room(x, y)
+        self._each(lambda arena: arena.put_obstacle(x, y))
+        self.num_obstacles += 1
+
+    def move_obstacle(self, number: int, x: float, y: float) -> None:
+        """Move an obstacle in every world.
+
+        Raises:
+            UserInputError: if there is none of that number, or it cannot stand there.
+        """
+        if not 0 <= number < self.num_obstacles:
+            raise UserInputError(f"there is no obstacle {number}: {self.num_obstacles} were put")
+        for robot in self.robots:
+            robot.arena.check_room(x, y)
+        self._each(lambda arena: arena.move_obstacle(number, x, y))
+
+    def push(self, side: float) -> None:
+        """Push all robots to their left (1.0) or to their right (-1.0)."""
+        self._each(lambda arena: arena.push(side))
+
+    def close(self) -> None:
+        """Free the physics."""
+        self._each(lambda arena: arena.close())
+
+    def _each(self, act: Callable[[Arena], None]) -> None:
+        for robot in self.robots:
+            act(robot.arena)
+
+
+def _drivers(names: list[str], choice: SceneChoice, offers: Offers) -> list[Driver]:
+    """Make who drives; a planner drives the robot, and sees with the sensor, of the agent beside it."""
+    if choice.map not in offers.places:
+        offers.source(choice.map)  # says so
+    if choice.sensor != AS_TRAINED and choice.sensor not in SENSORS:
+        known = ", ".join([AS_TRAINED, *sorted(SENSORS)])
+        raise UserInputError(f"sensor={shortened(choice.sensor)} does not exist: choose one of {known}")
+    sensor = None if choice.sensor == AS_TRAINED else choice.sensor
+    agents = {name: AgentDriver(offers.weights(name), sensor) for name in dict.fromkeys(names) if name not in PLANNERS}
+    first = next(iter(agents.values()), None)
+    robot: RobotSettings = PAPER if first is None else first.robot
+    beside = sensor or (NARROW if first is None else first.sensor)
+    drivers: list[Driver] = []
+    for name in names:
+        if name in PLANNERS:
+            drivers.append(PlannerDriver(name, robot, beside, choice.seed))
+        elif name in names[: len(drivers)]:  # the same agent twice has two memories
+            drivers.append(AgentDriver(offers.weights(name), sensor))
+        else:
+            drivers.append(agents[name])
+    for name, driver in zip(names, drivers, strict=True):
+        if driver.robot != robot:
+            raise UserInputError(
+                f"{name} drives robot={driver.robot.name} and {names[0]} robot={robot.name}: choose two of one robot"
+            )
+    return drivers
+
+
+def _dialled(driver: Driver, key: str, value: float | None) -> float | None:
+    if driver.dial is not None:
+        return driver.dial.check(key, value)
+    if value is not None and value != getattr(driver, "fixed_beta", None):
+        raise UserInputError(f"{key}={value:g} means nothing to who drives: leave it out")
+    return None
+
+
+def _arena(choice: SceneChoice, driver: Driver, offers: Offers) -> Arena:
+    if choice.map != OFFICE:
+        return MapArena(offers.source(choice.map), choice.seed, driver.robot, driver.sensor, driver.memory_s)
+    if driver.robot != PAPER:
+        raise UserInputError(f"the office is the paper's robot's, and this one is {driver.robot.name}: choose a map")
+    if isinstance(driver, AgentDriver):
+        check_sensor(choice.agent, driver.policy, Lens().view_deg)
+        return CourseArena(make_office(), driver.policy.config, choice.seed)
+    return CourseArena(make_office(), TaskSettings(), choice.seed)

@@ -1,0 +1,208 @@
+"""The server: pages on one port, for who may look at them."""
+
+import queue
+import socket
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from bokeh.application import Application
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from bokeh.server.util import bind_sockets
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop
+from tornado.web import HTTPError, RequestHandler
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.playground.offers import Offers
+from rcdsac_trl.playground.play_film import FilmStudio
+from rcdsac_trl.playground.play_page import PlayPage
+
+LOOPBACK = ("localhost", "127.0.0.1")
+# A page that nobody looks at any more ends after this.
+_UNUSED_MS = 6000
+_CHECK_UNUSED_MS = 1000
+_LARGEST_MESSAGE_BYTES = 1_000_000
+
+
+class PlayServer:
+    """Serves pages until it is stopped.
+
+    Args:
+        offers: what can be chosen.
+        host: name or address that it listens on.
+        port: likewise; 0 takes a free one.
+        origins: further ``<name>:<port>`` under which browsers may open pages.
+        max_sessions: so many drives at a time.
+        films: folder for films.
+
+    Attributes:
+        port: that it listens on.
+
+    Raises:
+        UserInputError: if it cannot listen there.
+    """
+
+    def __init__(
+        self, offers: Offers, *, host: str, port: int, origins: Sequence[str] = (), max_sessions: int, films: Path
+    ) -> None:
+        self._offers, self._host, self._max_sessions = offers, host, max_sessions
+        self._studio = FilmStudio(films)
+        self._pages: list[PlayPage] = []
+        self._driving = 0
+        self._lock = threading.Lock()
+        try:
+            if port:  # Tornado leaves sockets open that it could not bind
+                family = socket.AF_INET6 if ":" in host else socket.AF_INET
+                socket.create_server((host, port), family=family).close()
+            sockets, self.port = bind_sockets(host, port)
+        except OSError as error:
+            raise UserInputError(
+                f"nothing can listen on host={host} port={port} ({error.strerror}): choose another one, port=0 for any"
+            ) from None
+        names = LOOPBACK if host in LOOPBACK else (host,)
+        pages = BokehTornado(
+            {"/": Application(FunctionHandler(self._make_page))},
+            extra_websocket_origins=[*(f"{name}:{self.port}" for name in names), *origins],
+            extra_patterns=[(r"/films/([^/]+)", _FilmHandler, {"studio": self._studio})],
+            unused_session_lifetime_milliseconds=_UNUSED_MS,
+            check_unused_sessions_milliseconds=_CHECK_UNUSED_MS,
+            websocket_max_message_size_bytes=_LARGEST_MESSAGE_BYTES,
+        )
+        self._http = HTTPServer(pages)
+        self._http.add_sockets(sockets)
+        self._server = BaseServer(IOLoop.current(), pages, self._http)
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it."""
+        return f"http://{self._host}:{self.port}/"
+
+    @property
+    def num_drives(self) -> int:
+        """How many robots, or pairs of them, drive now."""
+        return self._driving
+
+    def start(self) -> None:
+        """Answer whoever asks, while the thread's event loop runs."""
+        self._server.start()
+
+    def run(self, *, browser: bool) -> None:
+        """Serve until Ctrl-C.
+
+        Args:
+            browser: open a page.
+        """
+        self.start()
+        if browser:
+            webbrowser.open(self.address)
+        try:
+            self._server.io_loop.start()
+        finally:
+            self.stop()
+
+    def stop(self) -> None:
+        """Answer no more, and end all drives."""
+        self._http.stop()
+        for page in self._pages:
+            page.close()
+        self._server.stop(wait=False)
+
+    def _make_page(self, document: Document) -> None:
+        context = document.session_context
+        assert context is not None
+        query = {
+            key: values[-1].decode(errors="replace") for key, values in context.request.arguments.items() if values
+        }
+        page = PlayPage(document, query, self._offers, self._studio, self._admit, self._leave)
+        self._pages.append(page)
+        document.on_session_destroyed(lambda context: self._pages.remove(page))
+
+    def _admit(self) -> None:
+        """Count another drive.
+
+        Raises:
+            UserInputError: if there are too many.
+        """
+        with self._lock:
+            if self._driving >= self._max_sessions:
+                raise UserInputError(
+                    f"{self._driving} pages drive already, and this server takes no more: close one of them, or start "
+                    "the server with a larger max_sessions"
+                )
+            self._driving += 1
+
+    def _leave(self) -> None:
+        with self._lock:
+            self._driving -= 1
+
+
+@contextmanager
+def in_thread(make: Callable[[], PlayServer]) -> Iterator[PlayServer]:
+    """Serve from a thread with an event loop of its own, as long as it is needed.
+
+    Args:
+        make: makes the server, in that thread.
+
+    Yields:
+        The server.
+    """
+    ready: queue.SimpleQueue[tuple[PlayServer, IOLoop] | BaseException] = queue.SimpleQueue()
+
+    def serve() -> None:
+        loop = IOLoop(make_current=False)
+        loop.add_callback(begin, loop)
+        loop.start()
+        loop.close()
+
+    def begin(loop: IOLoop) -> None:
+        try:
+            server = make()
+            server.start()
+        except BaseException as error:  # for who waits
+            ready.put(error)
+            loop.stop()
+        else:
+            ready.put((server, loop))
+
+    thread = threading.Thread(target=serve, name="play server", daemon=True)
+    thread.start()
+    made = ready.get()
+    if isinstance(made, BaseException):
+        raise made
+    server, loop = made
+    try:
+        yield server
+    finally:
+        loop.add_callback(server.stop)
+        loop.add_callback(loop.stop)
+        thread.join()
+
+
+class _FilmHandler(RequestHandler):
+    """Hands out films by name."""
+
+    def initialize(self, studio: FilmStudio) -> None:
+        self._studio = studio
+
+    def get(self, name: str) -> None:
+        path = self._studio.path(name)
+        if path is None or not path.is_file():
+            raise HTTPError(404)
+        self.set_header("Content-Type", "video/mp4" if path.suffix == ".mp4" else "image/gif")
+        self.write(path.read_bytes())
+
+
+def what_it_means(host: str) -> str | None:
+    """Return what follows of listening on a host; None for the loopback, which only this machine reaches."""
+    if host in LOOPBACK:
+        return None
+    return (
+        f"host={host}: whoever reaches this machine there can open pages, without a password. They can drive what is "
+        "offered, which takes processor time, and fetch films that were saved; no file is read by a path of theirs"
+    )

@@ -1,0 +1,74 @@
+"""What the verb ``play`` makes of its config: what is offered, and the server."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.config.play_settings import PlaySettings
+from rcdsac_trl.config.run_config import plain, read_config
+from rcdsac_trl.config.typed import read
+from rcdsac_trl.playground.offers import Offers
+from rcdsac_trl.playground.play_server import LOOPBACK, PlayServer, what_it_means
+from rcdsac_trl.system.progress import serving
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings
+from rcdsac_trl.world.maps.generator import MapSettings
+
+_OF_FILES = ("file", "barn")
+
+
+@dataclass(frozen=True)
+class PlaySession:
+    """A server that is yet to listen."""
+
+    settings: PlaySettings
+    offers: Offers
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        settings = self.settings
+        server = serve(self.offers, settings)
+        print(f"{server.address} drives {', '.join(self.offers.drivers)}; Ctrl-C ends it")
+        if (warning := what_it_means(settings.host)) is not None:
+            print(warning)
+        with serving():
+            server.run(browser=settings.browser and settings.host in LOOPBACK)
+
+
+def make_session(cfg: DictConfig) -> PlaySession:
+    """Read what is offered.
+
+    Raises:
+        UserInputError: for an agent or a map that cannot be read.
+    """
+    settings = read_config(cfg, PlaySettings)
+    return PlaySession(settings, offers_of(settings))
+
+
+def offers_of(settings: PlaySettings) -> Offers:
+    """Return agents and maps that settings name, with the map sets of ``conf/map/``."""
+    sets = {name: _map_settings(name) for name in choices("map") if name not in _OF_FILES}
+    files = {Path(path).stem: _file_settings(path) for path in settings.maps}
+    return Offers.of(settings.runs, dict(sorted(sets.items(), key=lambda item: item[0] != "mixed")), files)
+
+
+def serve(offers: Offers, settings: PlaySettings) -> PlayServer:
+    """Listen as settings say."""
+    return PlayServer(
+        offers,
+        host=settings.host,
+        port=settings.port,
+        origins=settings.origins,
+        max_sessions=settings.max_sessions,
+        films=Path(settings.films),
+    )
+
+
+def _map_settings(name: str) -> MapSettings:
+    return read(MapSettings, plain(compose("draw_maps", [f"map={name}"]))["map"], "map")
+
+
+def _file_settings(path: str) -> FileMapSettings:
+    values = plain(compose("draw_maps", ["map=file"]))["map"]
+    return read(FileMapSettings, values | {"path": path}, "map")

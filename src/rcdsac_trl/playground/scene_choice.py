@@ -1,0 +1,116 @@
+"""What a page shows, as a link says it: who drives where, with how much risk."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from urllib.parse import urlencode
+
+from rcdsac_trl.errors import UserInputError
+
+AS_TRAINED = "trained"
+"""The sensor that an agent was trained with."""
+NOBODY = "none"
+"""No second robot."""
+LARGEST_SEED = 10**9
+
+_SWITCHES = {"on": True, "off": False}
+_LONGEST_VALUE = 100
+
+
+@dataclass(frozen=True)
+class SceneChoice:
+    """A scene that can be opened again; every field is a key of the link's query.
+
+    Attributes:
+        agent: who drives, by a name of :class:`~rcdsac_trl.playground.offers.Offers`.
+        beta: how much risk it takes (of agents that are told a collision weight, that one); None: its default.
+        map: name of a map set, of a map that the server offers, or ``office``.
+        seed: root seed of the map, its movers and goals.
+        sensor: what the robot sees with; :data:`AS_TRAINED`: what the agent was trained with.
+        second: who drives a second robot in a world of the same seed; :data:`NOBODY`: nobody.
+        beta2: how much risk that one takes.
+        stop: whether a stop zone stands between who drives and the wheels.
+
+    Raises:
+        UserInputError: for a seed that is none.
+
+    Example:
+        >>> choice = SceneChoice.of_query({"agent": "sac-narrow", "beta": "-0.5", "stop": "on"})
+        >>> choice.beta, choice.stop, choice.query
+        (-0.5, True, 'agent=sac-narrow&beta=-0.5&stop=on')
+    """
+
+    agent: str
+    beta: float | None = None
+    map: str = "mixed"
+    seed: int = 0
+    sensor: str = AS_TRAINED
+    second: str = NOBODY
+    beta2: float | None = None
+    stop: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what is no seed."""
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise UserInputError(f"seed={self.seed} is outside [0, {LARGEST_SEED}]: give a whole number of that range")
+
+    @classmethod
+    def of_query(cls, query: Mapping[str, str], agent: str = "") -> "SceneChoice":
+        """Read a link's query.
+
+        Args:
+            query: values by key.
+            agent: who drives where the query does not say it.
+
+        Raises:
+            UserInputError: for an unknown key, or a value that cannot be read.
+        """
+        known = [field.name for field in fields(cls)]
+        values: dict[str, str | float | int | bool] = {"agent": agent}
+        for key, text in query.items():
+            if key not in known:
+                raise UserInputError(f"the link has no key {shortened(key)}: it may have {', '.join(known)}")
+            values[key] = _read(key, text)
+        return cls(**values)  # type: ignore[arg-type]
+
+    @property
+    def query(self) -> str:
+        """The link's query; what is as usual is left out."""
+        usual = type(self)(agent="")
+        told = {field.name: getattr(self, field.name) for field in fields(self)}
+        return urlencode({key: _written(value) for key, value in told.items() if value != getattr(usual, key)})
+
+    def with_betas(self, betas: Sequence[float | None]) -> "SceneChoice":
+        """Return the scene with other betas, one or two."""
+        return replace(self, beta=betas[0], beta2=betas[1] if len(betas) > 1 else None)
+
+
+def shortened(text: str) -> str:
+    """Return what somebody wrote, not longer than a sentence can bear."""
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}.."
+
+
+def _read(key: str, text: str) -> str | float | int | bool:
+    if key in ("beta", "beta2"):
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise UserInputError(f"{key}={shortened(text)} is no number: give one, such as -1")
+        return value
+    if key == "seed":
+        if not (text.isascii() and text.isdigit() and len(text) <= len(str(LARGEST_SEED))):
+            raise UserInputError(f"seed={shortened(text)} is no whole number from 0 to {LARGEST_SEED}: give one")
+        return int(text)
+    if key == "stop":
+        if text not in _SWITCHES:
+            raise UserInputError(f"stop={shortened(text)} is neither on nor off: choose one of them")
+        return _SWITCHES[text]
+    return text
+
+
+def _written(value: str | float | int | bool | None) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,242 @@
+"""The page in a real browser: the system's Chromium, without a window."""
+
+import re
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+from scenes_to_play import offers
+
+from rcdsac_trl.playground.palette import PALETTES
+from rcdsac_trl.playground.play_server import PlayServer, in_thread
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="there is no Chromium to open the page in: apt-get install chromium (make test says more)"
+)
+POW = "agent=rcdsac_pow-narrow"
+PATIENCE_S = 300.0
+GOAL, OBSTACLE = PALETTES["light"]["goal"], PALETTES["light"]["obstacle"]
+SWITCHES = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync"
+)
+OWN_LINES = re.compile(r"^\[bokeh|^Bokeh items were rendered")
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PlayServer]:
+    folder = tmp_path_factory.mktemp("films")
+    with in_thread(lambda: PlayServer(offers(), host="localhost", port=0, max_sessions=2, films=folder)) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES.split())
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def opened(browser: Browser, server: PlayServer) -> Iterator[Callable[..., Page]]:
+    """Open pages; at the end nothing but its own lines is on their consoles, and no drive is left."""
+    pages: list[Page] = []
+    said: list[str] = []
+
+    def open_(query: str = "", size: tuple[int, int] = (1280, 800), dark: bool = False) -> Page:
+        page = browser.new_page(
+            viewport={"width": size[0], "height": size[1]}, color_scheme="dark" if dark else "light"
+        )
+        page.set_default_timeout(1000 * PATIENCE_S)
+        page.on("console", lambda line: said.append(line.text))
+        page.on("pageerror", lambda error: said.append(f"error: {error}"))
+        page.on("request", lambda asked: said.append(asked.url) if str(server.port) not in asked.url else None)
+        page.goto(f"{server.address}?{query}")
+        pages.append(page)
+        return page
+
+    yield open_
+    for page in pages:
+        page.close()
+    until(lambda: server.num_drives == 0)
+    assert [line for line in said if not OWN_LINES.match(line) and not line.startswith("data:")] == []
+
+
+def until(found: Callable[[], object]) -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not found():
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+
+
+def field(page: Page, name: str, number: int = 0) -> str:
+    return page.locator(f"#robot{number} [data-field={name}]").inner_text()
+
+
+def seconds(page: Page, number: int = 0) -> float:
+    return float(field(page, "time", number).removesuffix(" s") or 0.0)
+
+
+def driving(page: Page) -> Page:
+    page.wait_for_function("parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > 0.5")
+    return page
+
+
+def model(page: Page, name: str, code: str) -> Any:
+    """Read something of a Bokeh model, by its name."""
+    return page.evaluate(
+        f"(name) => {{ const model = Bokeh.documents[0].get_model_by_name(name); return {code}; }}", name
+    )
+
+
+def on_map(page: Page, x: float, y: float) -> dict[str, float]:
+    """Return where a place, m, is in the first map's picture, px."""
+    low, high, bottom, top = model(
+        page, "map0", "[model.x_range.start, model.x_range.end, model.y_range.start, model.y_range.end]"
+    )
+    box = page.locator("#robot0 .map").bounding_box()
+    assert box is not None
+    return {"x": (x - low) / (high - low) * box["width"], "y": (top - y) / (top - bottom) * box["height"]}
+
+
+def filled(page: Page, color: str) -> list[list[float]]:
+    """Return the places of the round things of a colour that move or mark something, m."""
+    found: list[list[float]] = page.evaluate(
+        """(color) => {
+            const column = (data, key) => (data.get ? data.get(key) : data[key]) || [];
+            const places = [];
+            for (const { data_source } of Bokeh.documents[0].get_model_by_name("map0").renderers) {
+                const [x, y, fill] = ["x", "y", "fill"].map((key) => column(data_source.data, key));
+                Array.from(fill).forEach((each, at) => each === color && x.length && places.push([x[at], y[at]]));
+            }
+            return places;
+        }""",
+        color,
+    )
+    return found
+
+
+def goal(page: Page) -> list[float]:
+    return filled(page, GOAL)[-1]
+
+
+def obstacles(page: Page) -> list[list[float]]:
+    return filled(page, OBSTACLE)
+
+
+def picture(page: Page, name: str, tmp_path: Path) -> None:
+    """Keep a screenshot beside the test's other files, for who wants to look."""
+    path = tmp_path / f"{name}.png"
+    page.screenshot(path=path)
+    assert path.stat().st_size > 20_000  # an empty page is a few kB
+
+
+def test_a_robot_drives_and_beta_turns_it(opened, tmp_path) -> None:
+    page = driving(opened("agent=rcdsac_pow-narrow&beta=-2"))
+    assert field(page, "name") == "rcdsac_pow-narrow"
+    assert field(page, "beta") == "β = -2.00"
+    assert re.fullmatch(r"-?\d\.\d\d m/s", field(page, "speed"))
+    before = seconds(page)
+    page.wait_for_function(
+        f"parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > {before + 0.5}"
+    )
+    page.get_by_role("button", name="pause").click()
+    page.get_by_role("button", name="drive").wait_for()
+    told = field(page, "value")
+    page.locator(".noUi-handle").first.focus()
+    page.keyboard.press("End")
+    page.wait_for_function("document.querySelector('#robot0 [data-field=beta]').textContent === 'β = 0.00'")
+    page.wait_for_function(
+        "(told) => document.querySelector('#robot0 [data-field=value]').textContent !== told", arg=told
+    )
+    mean, value = re.findall(r"-?\d+\.\d", field(page, "value"))
+    assert mean == value  # neutral: the weighted mean is the mean
+    assert "beta=0" in page.url  # the link opens what is seen
+    picture(page, "one", tmp_path)
+
+
+def test_keys_and_buttons_do_what_they_say(opened) -> None:
+    page = driving(opened("agent=rcdsac_cvar-narrow&beta=0.5"))
+    page.keyboard.press("Space")
+    page.get_by_role("button", name="drive").wait_for()
+    stood = seconds(page)
+    page.keyboard.press(".")
+    page.wait_for_function(f"parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > {stood}")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_function("document.querySelector('#robot0 [data-field=beta]').textContent === 'β = 0.55'")
+    page.get_by_role("button", name="+ obstacle").click()
+    until(lambda: obstacles(page))
+    ((x, y),) = obstacles(page)
+    corner = page.locator("#robot0 .map").bounding_box()
+    assert corner is not None
+    for number, there in enumerate((on_map(page, x, y), on_map(page, x + 3.0, y))):
+        page.mouse.move(corner["x"] + there["x"], corner["y"] + there["y"], steps=4)
+        (page.mouse.up if number else page.mouse.down)()
+    until(lambda: obstacles(page) != [[x, y]])
+    assert obstacles(page)[0] == pytest.approx([x + 3.0, y], abs=0.15)
+    page.get_by_role("button", name="stop zone").click()
+    page.wait_for_function("window.location.search.includes('stop=on')")
+
+
+def test_a_click_sets_the_goal(opened) -> None:
+    page = driving(opened("agent=sac-narrow"))
+    page.get_by_role("button", name="pause").click()
+    page.get_by_role("button", name="drive").wait_for()
+    before = goal(page)
+    x, y = 5.0, 5.0
+    page.locator("#robot0 .map").click(position=on_map(page, x, y))  # type: ignore[arg-type]
+    until(lambda: goal(page) != before)
+    assert goal(page) == pytest.approx([x, y], abs=1.0)  # the nearest place that the robot can get to
+
+
+@pytest.mark.parametrize(
+    ("query", "sentence"),
+    [
+        ("agent=../../etc/passwd", "no agent ../../etc/passwd is offered"),
+        ("beta=<b>1</b>", "beta=<b>1</b> is no number"),
+    ],
+)
+def test_a_bad_link_ends_in_one_sentence(opened, query: str, sentence: str) -> None:
+    page = opened(query)
+    page.wait_for_function("document.getElementById('sentence').textContent")
+    assert page.locator("#sentence").inner_text().startswith(sentence)
+    assert not page.locator("#stage").is_visible()
+
+
+def test_sessions_share_nothing_one_too_many_is_told_so_and_a_closed_tab_ends_its_drive(
+    opened, server: PlayServer
+) -> None:
+    first, second = driving(opened(f"{POW}&beta=-2")), driving(opened(f"{POW}&beta=0&seed=2"))
+    assert server.num_drives == 2
+    assert [field(page, "beta") for page in (first, second)] == ["β = -2.00", "β = 0.00"]
+    third = opened()
+    third.wait_for_function("document.getElementById('sentence').textContent")
+    assert third.locator("#sentence").inner_text().startswith("2 pages drive already")
+    second.close()
+    until(lambda: server.num_drives == 1)
+    drives = [thread for thread in threading.enumerate() if thread.name == "drive"]
+    assert len(drives) == 1
+    before = seconds(first)
+    first.wait_for_function(f"parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > {before}")
+
+
+def test_two_robots_stand_side_by_side_and_a_narrow_window_below_each_other(opened, tmp_path) -> None:
+    page = driving(opened("agent=rcdsac_pow-narrow&beta=-2&second=mppi&seed=3", dark=True))
+    boxes = [page.locator(f"#robot{number} .map").bounding_box() for number in (0, 1)]
+    assert boxes[0] is not None
+    assert boxes[1] is not None
+    assert boxes[1]["x"] > boxes[0]["x"] + boxes[0]["width"]
+    assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+    assert field(page, "name", 1) == "mppi"
+    picture(page, "two-dark", tmp_path)
+    page.set_viewport_size({"width": 420, "height": 900})
+    page.wait_for_function("document.querySelector('#robot1').getBoundingClientRect().left < 30")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 420  # nothing sticks out
+    picture(page, "narrow", tmp_path)
