@@ -15,6 +15,8 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
+from rcdsac_trl.deploy.navigation.cost_to_go import cost_to_go
+from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
@@ -24,9 +26,7 @@ from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.rollout.planners.baselines import baseline_policy, check_baseline
 from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
-from rcdsac_trl.rollout.planners.cost_to_go import cost_to_go
 from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
-from rcdsac_trl.rollout.planners.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
 from rcdsac_trl.rollout.planners.trajectory_costs import (
     PERIOD_S,

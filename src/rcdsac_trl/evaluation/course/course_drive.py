@@ -10,16 +10,17 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
+from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings, Ranges
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
-from rcdsac_trl.evaluation.course.camera_rig import camera_poses, mounted, sectors_of_clouds
+from rcdsac_trl.deploy.sensors.sectors import Sectors
+from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered, mounted, sectors_of_clouds
 from rcdsac_trl.evaluation.course.odometry import Odometry, Pose
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.office.building import PERSON_HEIGHT_M, Office
 from rcdsac_trl.world.office.depth_cameras import DepthCameras, Lens
-from rcdsac_trl.world.sim.simulation import Simulation
+from rcdsac_trl.world.sim.simulation import Simulation, Touch
 from rcdsac_trl.world.task.rules import collision_due
 
 Direction = Literal["forward", "reverse"]
@@ -27,6 +28,10 @@ DIRECTIONS: tuple[Direction, ...] = ("forward", "reverse")
 
 # In motor steps of 0.02 s it is 7.5: a command takes effect at the next one, so it lasts 7 or 8 of them.
 _MOTOR_STEPS_OF_TWO = 15
+STANDS_M_PER_S = 0.05
+"""A robot that is slower stands."""
+STILL_M = 0.3
+"""A robot that stays so near to where it was gets nowhere."""
 
 
 class Pilot(Protocol):
@@ -52,6 +57,7 @@ class Conditions:
     odometry: OdometrySettings
     time_limit_s: float
     seed: int
+    ranges: Ranges = "cameras"
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,8 @@ class Trace:
         commands: what was commanded, m/s and rad/s, float64 [n, 2].
         stopped: whether the pilot refused to drive, bool [n].
         limited: whether speed limit or stop zone changed what the pilot wanted, bool [n].
+        reached_m: how far along the course it took itself to be at the end, m.
+        touches: how contacts began, each with the number of its row.
     """
 
     finished: bool
@@ -83,6 +91,8 @@ class Trace:
     commands: NDArray[np.float64]
     stopped: NDArray[np.bool_]
     limited: NDArray[np.bool_]
+    reached_m: float = 0.0
+    touches: tuple[tuple[int, Touch], ...] = ()
 
 
 def course_of(office: Office, direction: Direction) -> NDArray[np.float64]:
@@ -135,6 +145,7 @@ def drive_course(
     odometry = Odometry(conditions.odometry, pose, stream(conditions.seed, "course/odometry", *index))
     follower = PathFollower(course, pilot.config)
     poses = camera_poses(conditions.camera.view_deg)
+    in_view = covered(poses)
     with (
         contextlib.closing(Simulation()) as simulation,
         contextlib.closing(
@@ -151,13 +162,17 @@ def drive_course(
         pilot.reset()
         states = [_state(simulation, odometry, False)]
         steps: list[dict[str, Any]] = []
+        touches: list[tuple[int, Touch]] = []
         velocity = odometry.velocity(0.0, 0.0)
         while (waypoints := follower.update(odometry.pose)) is not None:
             now_s = len(steps) * PERIOD_S
             if now_s + PERIOD_S > conditions.time_limit_s:
                 break
             before_step()
-            seen = sectors_of_clouds(cameras.clouds(simulation.pose, simulation.mover_positions), poses)
+            if conditions.ranges == "exact":
+                seen = Sectors(np.where(in_view, simulation.scan(), np.inf), in_view)
+            else:
+                seen = sectors_of_clouds(cameras.clouds(simulation.pose, simulation.mover_positions), poses)
             stamps = Stamps(now_s, now_s, now_s, now_s)
             command = pilot.act(seen, waypoints, velocity, beta, stamps=stamps)
             commanded = (command.v_m_per_s, command.omega_rad_per_s)
@@ -165,10 +180,13 @@ def drive_course(
             step = {"distances_m": seen.distances_m, "velocities": velocity, "commands": commanded}
             limited = not command.stopped and command.reason is not None
             steps.append(step | {"stopped": command.stopped, "limited": limited})
+            if simulation.touch is not None and moved.in_contact and not states[-1]["in_contact"]:
+                touches.append((len(states), simulation.touch))
             odometry.move(moved.pose, PERIOD_S)
             velocity = odometry.velocity(moved.v_c, moved.omega_c)
             states.append(_state(simulation, odometry, moved.in_contact))
-    return Trace(bool(follower.reached), **_columns(states), **_columns(steps))
+    kept = {"reached_m": follower.along_m, "touches": tuple(touches)}
+    return Trace(bool(follower.reached), **_columns(states), **_columns(steps), **kept)
 
 
 def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int | bool]:
@@ -179,7 +197,9 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
         course: as it was driven, [k, 2].
 
     Returns:
-        `finished`; `time_s` until the end or the time limit; `collisions`, contacts that began; `contact_fraction` of
+        `finished`; `time_s` until the end or the time limit; `reached_m`, how far along the course it came;
+        `longest_still_s`, the longest time in which it stayed within 0.3 m of a place; `collisions`, contacts that
+        began; `own_collisions`, those without people who walked into a standing robot; `contact_fraction` of
         the steps; `driven_m`; `nearest_m`, smallest true distance from the robot's centre to anything; `stopped_steps`
         and `limited_steps`, in which the pilot refused to drive, or its limits changed its wish; `goal_error_m`, true
         distance to the goal at the end; `estimate_error_m`, the largest error of the estimated position.
@@ -189,7 +209,10 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
     return {
         "finished": trace.finished,
         "time_s": len(trace.commands) * PERIOD_S,
+        "reached_m": trace.reached_m,
+        "longest_still_s": longest_still_steps(trace.poses[:, :2]) * PERIOD_S,
         "collisions": sum(onsets),
+        "own_collisions": sum(is_own(touch) for _, touch in trace.touches),
         "contact_fraction": float(trace.in_contact[1:].mean()),
         "driven_m": float(np.hypot(*np.diff(trace.poses[:, :2], axis=0).T).sum()),
         "nearest_m": float(trace.nearest_m.min()),
@@ -198,6 +221,29 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
         "goal_error_m": float(np.hypot(*(trace.poses[-1, :2] - course[-1]))),
         "estimate_error_m": float(np.hypot(*(trace.estimates - trace.poses)[:, :2].T).max()),
     }
+
+
+def is_own(touch: Touch) -> bool:
+    """Return whether the robot drove into what it touched: not if a person walked into it while it stood."""
+    return touch.mover is None or abs(touch.v) >= STANDS_M_PER_S
+
+
+def longest_still_steps(places: NDArray[np.float64]) -> int:
+    """Return the most steps in which the robot stayed within 0.3 m of where it was before them.
+
+    Args:
+        places: its x and y after each step, [n, 2], m.
+
+    Example:
+        >>> longest_still_steps(np.array([(0.0, 0.0), (0.1, 0.0), (0.2, 0.0), (0.4, 0.0), (0.9, 0.0)]))
+        2
+    """
+    longest, first = 0, 0
+    for step in range(len(places)):
+        while math.dist(places[first], places[step]) > STILL_M:
+            first += 1
+        longest = max(longest, step - first)
+    return longest
 
 
 def _state(simulation: Simulation, odometry: Odometry, in_contact: bool) -> dict[str, Any]:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.navigation.cost_to_go import cost_to_go
+from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
-from rcdsac_trl.rollout.planners.cost_to_go import cost_to_go
-from rcdsac_trl.rollout.planners.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.system.jit import njit
 from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE, TaskSettings
 
