@@ -185,8 +185,8 @@ def drive_course(
             odometry.move(moved.pose, PERIOD_S)
             velocity = odometry.velocity(moved.v_c, moved.omega_c)
             states.append(_state(simulation, odometry, moved.in_contact))
-    kept = {"reached_m": follower.along_m, "touches": tuple(touches)}
-    return Trace(bool(follower.reached), **_columns(states), **_columns(steps), **kept)
+    columns = _columns(states) | _columns(steps)
+    return Trace(bool(follower.reached), **columns, reached_m=follower.along_m, touches=tuple(touches))
 
 
 def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int | bool]:
@@ -256,6 +256,6 @@ def _state(simulation: Simulation, odometry: Odometry, in_contact: bool) -> dict
     }
 
 
-def _columns(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+def _columns(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Stack rows that have the same keys."""
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
