@@ -22,6 +22,8 @@ from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered
+from rcdsac_trl.evaluation.course.course_collisions import collisions_of
 from rcdsac_trl.evaluation.course.course_drive import (
     Conditions,
     CourseWorld,
@@ -29,6 +31,7 @@ from rcdsac_trl.evaluation.course.course_drive import (
     Trace,
     course_of,
     drive_course,
+    is_own,
     measures,
     motor_steps,
     start_pose,
@@ -42,9 +45,11 @@ from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.planner import Planner
+from rcdsac_trl.world.maps.shapes import Box
 from rcdsac_trl.world.office.building import make_office, polyline_m
 from rcdsac_trl.world.office.depth_cameras import Lens
-from rcdsac_trl.world.sim.simulation import Simulation
+from rcdsac_trl.world.office.furniture import desk
+from rcdsac_trl.world.sim.simulation import Simulation, Touch
 from robots import DSAC, SAC, agent
 from tiny import yaml_of
 
@@ -175,6 +180,60 @@ def test_collisions_are_counted_as_they_begin() -> None:
     assert measured["time_s"] == pytest.approx(0.9)
 
 
+def test_what_a_pilot_is_told_exactly_is_what_the_range_sensor_says() -> None:
+    """Glass, too, and chairs as the robot may not enter them; beside and behind still nothing."""
+    pilot = Recorder()
+    drive(pilot, given=replace(SHORT, ranges="exact"))
+    in_view = covered(camera_poses(SMALL.view_deg))
+    with contextlib.closing(Simulation()) as simulation:
+        simulation.load(OFFICE.map, OFFICE.planner, start_pose(OFFICE.course), stream(0, "course/people", 0, 0))
+        exact = simulation.scan()
+    told = pilot.told[0][0]
+    assert np.array_equal(told.covered, in_view)
+    assert np.array_equal(told.distances_m, np.where(in_view, exact, np.inf))
+
+
+def test_an_office_without_people_or_hollow_furniture_has_the_same_course() -> None:
+    eased = make_office(people=False, hollow=False)
+    assert np.array_equal(eased.course, OFFICE.course)
+    assert len(eased.map.movers) == 0
+    chairs = [piece for piece in eased.pieces if piece.name == "chair"]
+    assert chairs
+    for piece in chairs:
+        (solid,) = piece.solids
+        assert (solid.shape, solid.low_m, solid.high_m) == (piece.footprint, 0.0, 0.88)
+    panes = [piece.solids for piece in eased.pieces if piece.glass]
+    assert panes == [piece.solids for piece in OFFICE.pieces if piece.glass]
+
+
+def test_a_collision_is_told_by_what_was_hit_and_when_it_was_seen() -> None:
+    """Pursuit of a goal behind a desk; the robot looks at it, and drives into it."""
+    table = desk(4.0, 2.0, 90.0)
+    assert isinstance(table.footprint, Box)
+    map_ = replace(OFFICE.map, boxes=(table.footprint,), cylinders=(), movers=())
+    course = np.array([[2.5, 2.0], [5.5, 2.0]])
+    office = replace(OFFICE, map=map_, pieces=(table,), course=course)
+    given = Conditions(SMALL, EXACT, time_limit_s=4.5, seed=0, ranges="exact")
+    trace = drive_course(office, PursuitPilot(), None, "forward", 0, given, lambda: None)
+    (row,) = collisions_of(office, trace).to_dict("records")
+    assert (row["thing"], row["own"], row["unseen_s"]) == ("desk", 1, 0.0)
+    assert row["x_m"] == pytest.approx(3.6, abs=0.01)
+    assert row["robot_x_m"] == pytest.approx(3.35, abs=0.03)
+    assert row["robot_v_m_per_s"] > 0.5
+    assert abs(row["bearing_rad"]) < math.radians(25.0)
+    measured = measures(trace, course)
+    assert (measured["collisions"], measured["own_collisions"]) == (1, 1)
+    assert measured["reached_m"] == pytest.approx(0.85, abs=0.05)
+    assert 1.0 < measured["longest_still_s"] < 3.5
+
+
+def test_a_person_who_walks_into_a_standing_robot_is_no_collision_of_its_own() -> None:
+    touch = Touch(0.0, 0.0, 3, (0.0, 0.0, 0.0), 0.0, 0.0, 0)
+    assert not is_own(touch)
+    assert is_own(touch._replace(v=0.3))
+    assert is_own(touch._replace(mover=None))
+
+
 # ------------------------------------------------------------------------------------------------ odometry
 def walk(settings: OdometrySettings, seconds: float) -> list[float]:
     """Drive a figure of eight; return the position's error at each step."""
@@ -248,7 +307,16 @@ def test_the_command_writes_the_paper_s_table_and_a_picture(
     monkeypatch.setattr("sys.argv", ["course", *asked])
     importlib.import_module("rcdsac_trl.course").main()
     out = tmp_path / "out"
-    names = {"course.json", "course.png", "office.json", "runs.csv", "table.csv", "table.md", "traces.csv"}
+    names = {
+        "collisions.csv",
+        "course.json",
+        "course.png",
+        "office.json",
+        "runs.csv",
+        "table.csv",
+        "table.md",
+        "traces.csv",
+    }
     assert {path.name for path in out.iterdir()} == names
     rows = pd.read_csv(out / "runs.csv")
     assert len(rows) == 4 * 2

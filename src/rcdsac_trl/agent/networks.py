@@ -23,13 +23,11 @@ from rcdsac_trl.agent.float32 import made_in_float32
 from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import LOG_STD_RANGE as LOG_STD_RANGE
 from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, HAT_OFFSETS, HAT_SLOPES, NUM_LOOK_AHEAD
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
-
-#: Bounds of the policy's log standard deviation.
-LOG_STD_RANGE = (-20.0, 2.0)
 
 
 @made_in_float32

@@ -3,10 +3,13 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.world.office.depth_cameras import Lens
+
+Ranges = Literal["cameras", "exact"]
 
 PERIOD_S = 0.15
 """Time between two commands, as on the paper's robot."""
@@ -65,9 +68,13 @@ class CourseSettings:
     beta: tuple[float, ...] | None
     baseline: Literal["pursuit"] | None
     guard_margin_m: float | None
+    navigation: NavigationSettings
     repetitions: int
     seed: int
     time_limit_s: float
+    people: bool
+    hollow: bool
+    ranges: Ranges
     record: bool
     out: str | None
     num_workers: int | Literal["auto"]

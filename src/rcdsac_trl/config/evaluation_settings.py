@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
 from rcdsac_trl.config.typed import read, section_class
 from rcdsac_trl.errors import UserInputError
@@ -108,6 +109,7 @@ class EvaluationSettings:
     collision_weight: tuple[float, ...] | None
     beta_controller: tuple[Literal["clearance", "tail_variance"], ...] | None
     controller: ControllerSettings
+    navigation: NavigationSettings
     checkpoint: Name | None
     baseline: str | None
     split: Literal["evaluation", "validation"]
@@ -136,6 +138,8 @@ class EvaluationSettings:
             )
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
+        if self.baseline is not None and (self.navigation.replan or self.navigation.watchdog):
+            raise UserInputError(f"baseline={self.baseline} navigates by itself: leave navigation out")
         asked = self.beta_controller or ()
         if asked and len(self.beta or ()) < 2:
             raise UserInputError(

@@ -121,6 +121,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: Chose
         controller=settings.controller if controllers else None,
         baseline=settings.baseline or PURSUIT,
         one_trip=chosen.barn is not None,
+        navigation=settings.navigation,
     )
 
 
@@ -136,6 +137,7 @@ def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: Name
         if spec.world.robot != PAPER:
             name = f"{spec.world.robot.name}-{name}"
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
+    name += "".join(f"-{part}" for part, is_on in asdict(spec.navigation).items() if is_on)
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
     return named.folder_of("evaluation", f"{name}{contexts}")
 
@@ -158,6 +160,7 @@ def _described(
         "num_maps": num_maps,
         "num_episodes": settings.num_episodes,
         "sampled": settings.sampled,
+        "navigation": asdict(settings.navigation),
         "conditions": [str(condition) for condition in spec.conditions],
         "map": asdict(spec.world.map_settings),
         "task": asdict(spec.world.task),

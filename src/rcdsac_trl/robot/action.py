@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
+LOG_STD_RANGE = (-20.0, 2.0)
+"""Bounds of the log standard deviation of an action before tanh."""
+
 # A bound given in degrees must hold for a float that went through radians: 15 deg/s itself is kept.
 _ANGULAR_TOLERANCE = 1e-6
 

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
@@ -14,7 +14,9 @@ from torch import Tensor
 
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import ControllerSettings
+from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.deploy.navigation.navigator import Navigator
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.rollout.beta_control import AdaptivePolicy
 from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
@@ -22,6 +24,7 @@ from rcdsac_trl.rollout.environments import evaluation_worker
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, unpacked_loss
 from rcdsac_trl.rollout.measurement import measure_map
+from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
 from rcdsac_trl.rollout.navigation_metrics import navigation_metrics
 from rcdsac_trl.rollout.planners.baselines import PURSUIT, baseline_policy
 from rcdsac_trl.rollout.planners.controller import ControllerPolicy
@@ -57,6 +60,7 @@ class EvaluationSpec:
         controller: settings of controllers, which then tell all agents beta; None: nothing turns it.
         baseline: what drives where there is no actor.
         one_trip: drive to the first goal alone; see :func:`~rcdsac_trl.rollout.measurement.measure_map`.
+        navigation: what navigates around the agents.
     """
 
     trained: TrainingSettings
@@ -72,6 +76,7 @@ class EvaluationSpec:
     controller: ControllerSettings | None = None
     baseline: str = PURSUIT
     one_trip: bool = False
+    navigation: NavigationSettings = field(default_factory=NavigationSettings)
 
 
 class Agent(NamedTuple):
@@ -114,6 +119,9 @@ def map_evaluator(
         policy = _policy(spec, actor, noise)
     planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
+    advised_noise = AgentNoise(agent_ids)
+    if spec.navigation.replan or spec.navigation.watchdog:
+        policy = _navigated(spec, policy, advised_noise)
     if spec.controller is not None:
         policy = adaptive = _adaptive(spec, spec.controller, policy, loss)
         more.append(lambda *_: {"mean_beta": adaptive.mean_betas()})
@@ -123,6 +131,7 @@ def map_evaluator(
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         # By the map's number, so that it does not matter which process drives it.
         noise.begin(spec.seed, "evaluation actions", map_index)
+        advised_noise.begin(spec.seed, "navigated actions", map_index)
         if planner is not None:
             planner.set_map(map_index)
         return measure_map(
@@ -143,6 +152,21 @@ def map_evaluator(
     finally:
         worker.close()
         torch.set_num_threads(threads)
+
+
+def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, noise: AgentNoise) -> NavigatedPolicy:
+    """Put navigators around the agents of a policy."""
+    algo, robot = spec.trained.algo, spec.world.robot
+    boldest = algo.distortion.measure.high if algo.context_key == "risk" else None
+    period_s = sum(spec.world.task.motor_steps) / len(spec.world.task.motor_steps) * robot.motor_period_s
+    make = partial(_navigator, spec)
+    return NavigatedPolicy(policy, make, robot.sensor_mask(spec.world.sensor), noise, boldest, period_s, robot)
+
+
+def _navigator(spec: EvaluationSpec) -> Navigator:
+    navigator = navigator_of(spec.navigation, spec.world.robot)
+    assert navigator is not None  # else nobody asks for one
+    return navigator
 
 
 def _all(measures: Sequence[Measure], map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:

@@ -77,3 +77,51 @@ def _sweep(
                         values[i, j] = value
         if change < _SETTLED_M:
             return
+
+
+def steepest_way(
+    values: NDArray[np.float64], corner: tuple[float, float], cell_m: float, start: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Return the way from a start down :func:`cost_to_go`, to the target's cell or out of the square.
+
+    Args:
+        values: of :func:`cost_to_go`, float64 [n, n].
+        corner: lower corner of the square, x and y in m.
+        cell_m: side of a cell, m.
+        start: x and y in m, in the square.
+
+    Returns:
+        The start and the middles of cells, float64 [k, 2], m.
+
+    Example:
+        >>> values = cost_to_go(np.ones((21, 21)), (0.0, 0.0), 0.1, (1.05, 1.05))
+        >>> steepest_way(values, (0.0, 0.0), 0.1, (0.85, 1.05)).round(2).tolist()
+        [[0.85, 1.05], [0.95, 1.05], [1.05, 1.05]]
+    """
+    places = np.empty((values.size, 2))
+    return places[: _descend(places, values, *corner, cell_m, *start)].copy()
+
+
+@njit
+def _descend(
+    places: np.ndarray, values: np.ndarray, x0: float, y0: float, cell_m: float, start_x: float, start_y: float
+) -> int:
+    n = values.shape[0]
+    i, j = math.floor((start_y - y0) / cell_m), math.floor((start_x - x0) / cell_m)
+    places[0, 0], places[0, 1] = start_x, start_y
+    number = 1
+    while 0 < i < n - 1 and 0 < j < n - 1:
+        best_i, best_j, steepest = i, j, 0.0
+        for di in range(-1, 2):
+            for dj in range(-1, 2):
+                if di == 0 and dj == 0:
+                    continue
+                slope = (values[i, j] - values[i + di, j + dj]) / math.hypot(di, dj)
+                if slope > steepest:
+                    best_i, best_j, steepest = i + di, j + dj, slope
+        if best_i == i and best_j == j:
+            break
+        i, j = best_i, best_j
+        places[number, 0], places[number, 1] = x0 + (j + 0.5) * cell_m, y0 + (i + 0.5) * cell_m
+        number += 1
+    return number

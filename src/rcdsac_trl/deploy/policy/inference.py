@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.weights import Weights
+from rcdsac_trl.robot.action import LOG_STD_RANGE
 from rcdsac_trl.robot.look_ahead import look_ahead
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
@@ -172,19 +173,22 @@ class Actor:
         self._input, self._hidden, self._output = (_linear(parts, name) for name in ("input", "hidden", "output"))
         self._gate = _linear(parts, "gate") if "gate.weight" in parts[0] else None
 
-    def action(self, read: Array, embedded: float | None) -> Array:
-        """Return the deterministic action tanh(mean), [2].
+    def action(self, read: Array, embedded: float | None, noise: Array | None = None) -> Array:
+        """Return an action, [2]: tanh(mean), or a drawn one.
 
         Args:
             read: [n], see :meth:`Encoders.heads_read`.
             embedded: ``beta`` in [0, 1]; None where the networks read none.
+            noise: standard normal numbers to draw it with, [2]; None: the mean is meant.
         """
         x = _rectified(read[None], self._input)
         if self._gate is not None and embedded is not None:
             x *= _rectified(_cosines(embedded, self._angles), self._gate)
         weight, bias = self._output
-        mean = _rectified(x, self._hidden) @ weight + bias
-        return np.tanh(mean[0, 0, :2])
+        outputs = (_rectified(x, self._hidden) @ weight + bias)[0, 0]
+        if noise is None:
+            return np.tanh(outputs[:2])
+        return np.tanh(outputs[:2] + noise * np.exp(np.clip(outputs[2:], *LOG_STD_RANGE)))
 
 
 class Critics:

@@ -115,6 +115,11 @@ class PathFollower:
         return (self._two() - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
 
     @property
+    def along_m(self) -> float:
+        """How far along the path the robot has got, m."""
+        return self._along_m
+
+    @property
     def _goal_m(self) -> float:
         return self._config.goal_radius_m
 

@@ -1,6 +1,7 @@
 """The object that drives: observations in, a velocity command and the risk of it out, one call a control period."""
 
 import copy
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -26,8 +27,10 @@ from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.robot.sectors import Sectors, is_finite_number, is_whole_number
+from rcdsac_trl.seeding import stream
 
 if TYPE_CHECKING:
+    from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator
     from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 
 # After so many calls without good input in a row, or so many of the longest periods of training without one, the memory
@@ -87,6 +90,8 @@ class Policy:
             None drives without, which is for simulations that count collisions.
         limits: how old, and how gappy, input may be.
         num_quantiles: at how many fractions the return's distribution is told.
+        navigator: hands out other waypoints where the way is blocked, and helps where the robot gets nowhere; None:
+            the agent is on its own.
 
     Attributes:
         config: what the agent is.
@@ -106,11 +111,13 @@ class Policy:
         guard: Guard | Literal["robot"] | None = "robot",
         limits: InputLimits = InputLimits(),  # noqa: B008 (frozen)
         num_quantiles: int = 16,
+        navigator: "Navigator | None" = None,
     ) -> None:
         self.config = weights.config
         self.robot = self.config.robot
         self.guard = _guard_of(self.robot, guard)
         self.limits = limits
+        self.navigator = navigator
         self.fractions = fractions_of(num_quantiles)
         context = self.config.context_range
         middle = None if context is None else (context[0] + context[1]) / 2.0
@@ -144,11 +151,16 @@ class Policy:
         self._last_fresh: Stamps | None = None
         self._wanted: tuple[float, float] | None = None
         self._told: tuple[NDArray[np.float32] | None, float] | None = None
+        self._advice: Advice | None = None
+        self._noise = stream(0, "drawn actions of a policy")
+        if self.navigator is not None:
+            self.navigator.reset()
 
     def __copy__(self) -> "Policy":
         """Copy the situation, and share what never changes."""
         copied = object.__new__(type(self))
-        copied.__dict__ |= self.__dict__ | {"_remembered": copy.deepcopy(self._remembered)}
+        own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_remembered", "navigator", "_noise")}
+        copied.__dict__ |= self.__dict__ | own
         return copied
 
     def foresee(self, beta: float | None = None, *, action: Any = None) -> Outlook:
@@ -278,8 +290,19 @@ class Policy:
         self._last = stamps
         if fresh:
             self._last_fresh = stamps
+            if self.navigator is not None:
+                self._advice = self.navigator.advise(
+                    sectors.distances_m, sectors.covered, next_two, measured, elapsed_s
+                )
+                next_two, context = self._advice.waypoints, self._bolder(context, self._advice.boldness)
             self._ask(sectors, next_two, measured, context, elapsed_s)
         return self._command(sectors, measured, fresh, fresh and forgot)
+
+    def _bolder(self, context: float | None, boldness: float) -> float | None:
+        """Return a beta that is turned towards the boldest of training; a collision weight stays."""
+        if context is None or self.config.context != "beta" or self.config.context_range is None:
+            return context
+        return context + boldness * (self.config.context_range[1] - context)
 
     def _is_due(self, stamps: Stamps | None) -> bool:
         """Return whether the agent is asked; else the robot goes on as it was told last, guarded anew."""
@@ -321,7 +344,12 @@ class Policy:
         self._states = self._encoders.step(bins, told, self._states)
         self._read = self._encoders.heads_read(self._states, told)
         self._steps += 1
-        outlook = self._outlook(self._embedded(context))
+        embedded = self._embedded(context)
+        drawn = None
+        if self._advice is not None and self._advice.draws:
+            noise = self._noise.standard_normal(2, np.float32)
+            drawn = self._actor.action(self._read[0], embedded, noise)
+        outlook = self._outlook(embedded, drawn)
         self._wanted = outlook.wanted
         self._told = outlook.quantiles, outlook.value
 
@@ -342,13 +370,21 @@ class Policy:
     def _command(self, sectors: Sectors, measured: tuple[float, float], fresh: bool, forgot: bool) -> Command:
         assert self._wanted is not None
         assert self._told is not None
-        v, omega, reason = *self._wanted, None
+        (v, omega), reason, been = self._wanted, None, None
+        told = None
+        if self._advice is not None:
+            sectors = replace(sectors, distances_m=self._advice.distances_m if fresh else sectors.distances_m)
+            been = self._advice.been
+            if self._advice.instead is not None:
+                v, omega = self._advice.instead
+                told = "it got nowhere and backs off; the agent drives on then"
         if self.guard is not None:
-            v, omega, reason = self.guard.limit(v, omega, sectors, measured)
+            v, omega, reason = self.guard.limit(v, omega, sectors, measured, been)
         # Networks are told what the robot was told: the limits are part of the world.
         self._commanded = (v, omega)
         quantiles, value = self._told
-        told = None if reason is None else f"limited by {reason}; it ends when the cause does"
+        if reason is not None:
+            told = f"limited by {reason}; it ends when the cause does"
         return Command(v, omega, False, told, self._wanted, quantiles, value, fresh, forgot)
 
     def refuse(self, reason: str) -> Command:

@@ -10,18 +10,18 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
+from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings, Ranges
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.course.camera_rig import camera_poses, mounted, sectors_of_clouds
+from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered, mounted, sectors_of_clouds
 from rcdsac_trl.evaluation.course.odometry import Odometry, Pose
 from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.office.building import PERSON_HEIGHT_M, Office
 from rcdsac_trl.world.office.depth_cameras import DepthCameras, Lens
-from rcdsac_trl.world.sim.simulation import Simulation, StepResult
+from rcdsac_trl.world.sim.simulation import Simulation, StepResult, Touch
 from rcdsac_trl.world.task.rules import collision_due
 
 Direction = Literal["forward", "reverse"]
@@ -31,6 +31,10 @@ DIRECTIONS: tuple[Direction, ...] = ("forward", "reverse")
 _MOTOR_STEPS_OF_TWO = 15
 # Outside of everything: there are the cylinders that nobody has put anywhere yet.
 _NOWHERE_M = -100.0
+STANDS_M_PER_S = 0.05
+"""A robot that is slower stands."""
+STILL_M = 0.3
+"""A robot that stays so near to where it was gets nowhere."""
 
 
 class Pilot(Protocol):
@@ -56,6 +60,7 @@ class Conditions:
     odometry: OdometrySettings
     time_limit_s: float
     seed: int
+    ranges: Ranges = "cameras"
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,8 @@ class Trace:
         commands: what was commanded, m/s and rad/s, float64 [n, 2].
         stopped: whether the pilot refused to drive, bool [n].
         limited: whether speed limit or stop zone changed what the pilot wanted, bool [n].
+        reached_m: how far along the course it took itself to be at the end, m.
+        touches: how contacts began, each with the number of its row.
     """
 
     finished: bool
@@ -87,6 +94,8 @@ class Trace:
     commands: NDArray[np.float64]
     stopped: NDArray[np.bool_]
     limited: NDArray[np.bool_]
+    reached_m: float = 0.0
+    touches: tuple[tuple[int, Touch], ...] = ()
 
 
 def course_of(office: Office, direction: Direction) -> NDArray[np.float64]:
@@ -144,6 +153,7 @@ class CourseWorld:
         self.odometry = Odometry(conditions.odometry, pose, stream(conditions.seed, "course/odometry", *index))
         self.follower = PathFollower(course, config)
         self._poses = camera_poses(conditions.camera.view_deg)
+        self._in_view = covered(self._poses) if conditions.ranges == "exact" else None
         self._spare_discs = tuple(spare_discs)
         self.simulation = Simulation()
         self._cameras = DepthCameras(
@@ -162,7 +172,9 @@ class CourseWorld:
         return self.follower.update(self.odometry.pose)
 
     def seen(self) -> Sectors:
-        """Return what the cameras say now."""
+        """Return what the pilot is told now: what the cameras say, or what is truly there."""
+        if self._in_view is not None:
+            return Sectors(np.where(self._in_view, self.simulation.scan(), np.inf), self._in_view)
         put_xy = np.full((len(self._spare_discs), 2), _NOWHERE_M)
         put = self.simulation.put_discs
         put_xy[: len(put)] = put[:, :2]
@@ -221,6 +233,7 @@ def drive_course(
         pilot.reset()
         states = [_state(world, False)]
         steps: list[dict[str, Any]] = []
+        touches: list[tuple[int, Touch]] = []
         while (waypoints := world.waypoints()) is not None:
             now_s = len(steps) * PERIOD_S
             if now_s + PERIOD_S > conditions.time_limit_s:
@@ -234,8 +247,12 @@ def drive_course(
             step = {"distances_m": seen.distances_m, "velocities": velocity, "commands": commanded}
             limited = not command.stopped and command.reason is not None
             steps.append(step | {"stopped": command.stopped, "limited": limited})
+            touch = world.simulation.touch
+            if touch is not None and moved.in_contact and not states[-1]["in_contact"]:
+                touches.append((len(states), touch))
             states.append(_state(world, moved.in_contact))
-        return Trace(bool(world.follower.reached), **_columns(states), **_columns(steps))
+        columns = _columns(states) | _columns(steps)
+        return Trace(bool(world.follower.reached), **columns, reached_m=world.follower.along_m, touches=tuple(touches))
 
 
 def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int | bool]:
@@ -246,7 +263,9 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
         course: as it was driven, [k, 2].
 
     Returns:
-        `finished`; `time_s` until the end or the time limit; `collisions`, contacts that began; `contact_fraction` of
+        `finished`; `time_s` until the end or the time limit; `reached_m`, how far along the course it came;
+        `longest_still_s`, the longest time in which it stayed within 0.3 m of a place; `collisions`, contacts that
+        began; `own_collisions`, those without people who walked into a standing robot; `contact_fraction` of
         the steps; `driven_m`; `nearest_m`, smallest true distance from the robot's centre to anything; `stopped_steps`
         and `limited_steps`, in which the pilot refused to drive, or its limits changed its wish; `goal_error_m`, true
         distance to the goal at the end; `estimate_error_m`, the largest error of the estimated position.
@@ -256,7 +275,10 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
     return {
         "finished": trace.finished,
         "time_s": len(trace.commands) * PERIOD_S,
+        "reached_m": trace.reached_m,
+        "longest_still_s": longest_still_steps(trace.poses[:, :2]) * PERIOD_S,
         "collisions": sum(onsets),
+        "own_collisions": sum(is_own(touch) for _, touch in trace.touches),
         "contact_fraction": float(trace.in_contact[1:].mean()),
         "driven_m": float(np.hypot(*np.diff(trace.poses[:, :2], axis=0).T).sum()),
         "nearest_m": float(trace.nearest_m.min()),
@@ -265,6 +287,29 @@ def measures(trace: Trace, course: NDArray[np.float64]) -> dict[str, float | int
         "goal_error_m": float(np.hypot(*(trace.poses[-1, :2] - course[-1]))),
         "estimate_error_m": float(np.hypot(*(trace.estimates - trace.poses)[:, :2].T).max()),
     }
+
+
+def is_own(touch: Touch) -> bool:
+    """Return whether the robot drove into what it touched: not if a person walked into it while it stood."""
+    return touch.mover is None or abs(touch.v) >= STANDS_M_PER_S
+
+
+def longest_still_steps(places: NDArray[np.float64]) -> int:
+    """Return the most steps in which the robot stayed within 0.3 m of where it was before them.
+
+    Args:
+        places: its x and y after each step, [n, 2], m.
+
+    Example:
+        >>> longest_still_steps(np.array([(0.0, 0.0), (0.1, 0.0), (0.2, 0.0), (0.4, 0.0), (0.9, 0.0)]))
+        2
+    """
+    longest, first = 0, 0
+    for step in range(len(places)):
+        while math.dist(places[first], places[step]) > STILL_M:
+            first += 1
+        longest = max(longest, step - first)
+    return longest
 
 
 def _state(world: CourseWorld, in_contact: bool) -> dict[str, Any]:
@@ -277,6 +322,6 @@ def _state(world: CourseWorld, in_contact: bool) -> dict[str, Any]:
     }
 
 
-def _columns(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+def _columns(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Stack rows that have the same keys."""
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}

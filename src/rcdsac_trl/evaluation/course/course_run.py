@@ -9,12 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.course_settings import PERIOD_S, CourseSettings
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.deploy import Policy
+from rcdsac_trl.evaluation.course.course_collisions import collisions_of
 from rcdsac_trl.evaluation.course.course_drive import (
     DIRECTIONS,
     Conditions,
@@ -64,8 +66,9 @@ def jobs_of(entries: int, repetitions: int) -> list[Job]:
 def make_course(cfg: DictConfig) -> MeasuredRun:
     """Make a drive of agents over the course; refuses before anything is written.
 
-    It writes ``runs.csv``, one row a run; ``traces.csv``, one row a control period; ``office.json``, what stands where;
-    ``course.json``; and, if asked for, films of the first repetition of each.
+    It writes ``runs.csv``, one row a run; ``traces.csv``, one row a control period; ``collisions.csv``, one row a
+    collision; ``office.json``, what stands where; ``course.json``; and, if asked for, films of the first repetition of
+    each.
 
     Raises:
         UserInputError: for an agent that is missing or sees what the cameras do not, a beta outside its range, or a
@@ -79,10 +82,11 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
     processes = resolve_processes(settings.num_workers, len(jobs))
     simulations = 2 * max(1, processes)  # the physics, and what the cameras see
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, "lower num_workers")
-    conditions = Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed)
+    conditions = Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed, settings.ranges)
+    office = partial(make_office, settings.people, settings.hollow)
 
     def drives(watch: Watch) -> Generator[Rows, None, None]:
-        make = partial(_driver, entries, jobs, conditions, settings.record)
+        make = partial(_driver, office, entries, jobs, conditions, settings.record)
         return evaluate_maps(make, len(jobs), processes, watch)
 
     return MeasuredRun(
@@ -94,8 +98,8 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
         unit_steps=math.ceil(min(COURSE_M / _USUAL_SPEED_M_PER_S, settings.time_limit_s) / PERIOD_S),
         processes=processes,
         measure=drives,
-        findings=_findings,
-        film=partial(_films, entries) if settings.record else None,
+        findings=partial(_findings, office),
+        film=partial(_films, office, entries) if settings.record else None,
     )
 
 
@@ -106,9 +110,13 @@ def _described(settings: CourseSettings, entries: Sequence[Entry]) -> dict[str, 
         "agents": {entry.run: asdict(entry.pilot.config) for entry in entries if isinstance(entry.pilot, Policy)},
         "course_m": COURSE_M,
         "guard_margin_m": settings.guard_margin_m,
+        "navigation": asdict(settings.navigation),
         "repetitions": settings.repetitions,
         "seed": settings.seed,
         "time_limit_s": settings.time_limit_s,
+        "people": settings.people,
+        "hollow": settings.hollow,
+        "ranges": settings.ranges,
         "camera": asdict(settings.camera),
         "odometry": asdict(settings.odometry),
         "rules_version": RULES_VERSION,
@@ -122,14 +130,22 @@ def _default_out(settings: CourseSettings, entries: Sequence[Entry]) -> Path:
     betas = "" if settings.beta is None else "-beta" + "_".join(f"{beta:g}" for beta in settings.beta)
     who = "" if folder != Path("course") else "-".join(Path(run).name for run in runs) + "-"
     margin = "none" if settings.guard_margin_m is None else f"{settings.guard_margin_m:g}"
-    return folder / f"{who}seed{settings.seed}-{settings.repetitions}x{betas}-guard{margin}"
+    ideal = asdict(settings.navigation) | {
+        "nobody": not settings.people,
+        "solid": not settings.hollow,
+        "exact": settings.ranges == "exact",
+    }
+    eased = "".join(f"-{name}" for name, is_so in ideal.items() if is_so)
+    return folder / f"{who}seed{settings.seed}-{settings.repetitions}x{betas}-guard{margin}{eased}"
 
 
 @contextlib.contextmanager
-def _driver(entries: Sequence[Entry], jobs: Sequence[Job], conditions: Conditions, record: bool) -> Iterator[Drive]:
+def _driver(
+    make: Callable[[], Office], entries: Sequence[Entry], jobs: Sequence[Job], conditions: Conditions, record: bool
+) -> Iterator[Drive]:
     """Make what drives one run after another, in this process."""
     runtime.set_threads(1)
-    office = make_office()
+    office = make()
 
     def drive(number: int, before_step: Callable[[], None]) -> Rows:
         job = jobs[number]
@@ -147,6 +163,7 @@ def _driver(entries: Sequence[Entry], jobs: Sequence[Job], conditions: Condition
             "job": job,
             "measures": labels | measures(trace, course_of(office, job.direction)),
             "steps": _steps(trace).assign(**labels),
+            "collisions": collisions_of(office, trace).assign(**labels),
         }
         # Only what is filmed is kept whole.
         return [row | {"trace": trace} if record and job.repetition == 0 else row]
@@ -154,19 +171,20 @@ def _driver(entries: Sequence[Entry], jobs: Sequence[Job], conditions: Condition
     yield drive
 
 
-def _findings(rows: Rows) -> Findings:
+def _findings(make: Callable[[], Office], rows: Rows) -> Findings:
     rows = sorted(rows, key=lambda row: row["number"])
     tables = {
         "runs.csv": pd.DataFrame([row["measures"] for row in rows]),
         "traces.csv": pd.concat([row["steps"] for row in rows], ignore_index=True),
+        "collisions.csv": pd.concat([row["collisions"] for row in rows], ignore_index=True),
     }
     written = {name: table.to_csv(index=False, float_format="%.6g") for name, table in tables.items()}
-    return Findings(written | {"office.json": plan_of(make_office())})
+    return Findings(written | {"office.json": plan_of(make())})
 
 
-def _films(entries: Sequence[Entry], folder: Path, rows: Rows) -> list[Path]:
+def _films(make: Callable[[], Office], entries: Sequence[Entry], folder: Path, rows: Rows) -> list[Path]:
     """Film the runs whose traces were kept."""
-    office = make_office()
+    office = make()
     kept = sorted((row for row in rows if "trace" in row), key=lambda row: row["number"])
     files = []
     with Work(f"{counted(len(kept), 'film')}, for {folder}", len(kept), "film") as work:
@@ -211,5 +229,9 @@ def _steps(trace: Trace) -> pd.DataFrame:
         "estimate_y_m": trace.estimates[:, 1],
         "nearest_m": trace.nearest_m,
         "in_contact": trace.in_contact.astype(int),
+        # Of the command that follows, which the last row has none of.
+        "v_m_per_s": np.append(trace.commands[:, 0], np.nan),
+        "omega_rad_per_s": np.append(trace.commands[:, 1], np.nan),
+        "limited": np.append(trace.limited.astype(float), np.nan),
     }
     return pd.DataFrame(columns)

@@ -13,6 +13,7 @@ from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered
 from rcdsac_trl.evaluation.course.course_drive import Pilot
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
 from rcdsac_trl.robot.robot_settings import PAPER
+from rcdsac_trl.rollout.navigation import navigator_of
 
 # What the paper's second table sets each measure to.
 _PAPER_BETAS = {"cvar": (0.25, 0.75), "pow": (-2.0, -1.0)}
@@ -63,6 +64,7 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
                 "robot=paper"
             )
         policy.guard = None if settings.guard_margin_m is None else Guard(margin_m=settings.guard_margin_m)
+        policy.navigator = navigator_of(settings.navigation, policy.robot)
         check_sensor(run, policy, settings.camera.view_deg)
     conditioned = [run for run, policy in policies.items() if policy.config.context == "beta"]
     if settings.beta is not None and not conditioned:

@@ -77,8 +77,12 @@ class Office:
 
 
 @cache
-def make_office() -> Office:
+def make_office(people: bool = True, hollow: bool = True) -> Office:
     """Build the office and plan the course; the same at every call.
+
+    Args:
+        people: whether anybody walks about.
+        hollow: whether desks, chairs, tables and stools are; else cameras see all of them.
 
     Example:
         >>> office = make_office()
@@ -86,13 +90,15 @@ def make_office() -> Office:
         53.7
     """
     pieces = (*_building(), *_open_plan(), *_rooms(), *_lounge())
+    if not hollow:
+        pieces = tuple(piece.filled() for piece in pieces)
     footprints = [piece.footprint for piece in pieces]
     map_ = Map(
         layout="office",
         size_m=_SIZE_M,
         boxes=tuple(shape for shape in footprints if isinstance(shape, Box)),
         cylinders=tuple(shape for shape in footprints if isinstance(shape, Cylinder)),
-        movers=tuple(Mover(radius, speed) for radius, speed in PEOPLE),
+        movers=tuple(Mover(radius, speed) for radius, speed in PEOPLE) if people else (),
     )
     planner = Planner(map_)
     course = _cut(_planned(planner, _STATIONS), COURSE_M)

@@ -8,7 +8,7 @@ for glass, which stops the robot and shows to no camera.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rcdsac_trl.world.maps.shapes import Box, Cylinder
 
@@ -40,18 +40,26 @@ class Piece:
     Attributes:
         footprint: what the robot cannot enter; says, too, whether the planner knows the piece.
         solids: what depth cameras see; none for a pane without a frame.
+        name: what it is.
         glass: whether it covers more than its solids do.
     """
 
     footprint: Box | Cylinder
     solids: tuple[Solid, ...]
+    name: str
     glass: bool = False
+
+    def filled(self) -> "Piece":
+        """Return the piece as it were if it were not hollow: its footprint from the floor to its top; glass stays."""
+        if self.glass or not self.solids:
+            return self
+        return replace(self, solids=(Solid(self.footprint, 0.0, max(solid.high_m for solid in self.solids)),))
 
 
 def wall(x0: float, y0: float, x1: float, y1: float) -> Piece:
     """Return a wall along a line that is parallel to an axis."""
     box = _along(x0, y0, x1, y1, WALL_M)
-    return Piece(box, (Solid(box, 0.0, WALL_HEIGHT_M),))
+    return Piece(box, (Solid(box, 0.0, WALL_HEIGHT_M),), "wall")
 
 
 def wall_with_openings(
@@ -77,7 +85,7 @@ def glass(x0: float, y0: float, x1: float, y1: float, framed: bool = True) -> Pi
     """Return a glass wall: the planner knows it, cameras see its frame alone, and nothing of one without."""
     box = _along(x0, y0, x1, y1, GLASS_M)
     if not framed:
-        return Piece(box, (), glass=True)
+        return Piece(box, (), "glass without a frame", glass=True)
     half = GLASS_M / 2.0
     spans = max(1, round(math.hypot(x1 - x0, y1 - y0) / POST_EVERY_M))
     # The outermost posts stand within the pane's ends.
@@ -87,7 +95,7 @@ def glass(x0: float, y0: float, x1: float, y1: float, framed: bool = True) -> Pi
         Box(x0 + (x1 - x0) * part, y0 + (y1 - y0) * part, half, half, 0.0, mapped=True, wall=True) for part in share
     ]
     solids = (Solid(box, 0.0, RAIL_M), *(Solid(post, 0.0, WALL_HEIGHT_M) for post in posts))
-    return Piece(box, solids, glass=True)
+    return Piece(box, solids, "glass", glass=True)
 
 
 def desk(x: float, y: float, yaw_deg: float = 0.0, length_m: float = 1.6, depth_m: float = 0.8) -> Piece:
@@ -95,7 +103,7 @@ def desk(x: float, y: float, yaw_deg: float = 0.0, length_m: float = 1.6, depth_
     top = _box(x, y, length_m / 2.0, depth_m / 2.0, yaw_deg, mapped=True)
     end = length_m / 2.0 - 0.02
     panels = [_beside(top, side * end, 0.0, 0.02, depth_m / 2.0) for side in (-1.0, 1.0)]
-    return Piece(top, (Solid(top, 0.70, 0.74), *(Solid(panel, 0.0, 0.70) for panel in panels)))
+    return Piece(top, (Solid(top, 0.70, 0.74), *(Solid(panel, 0.0, 0.70) for panel in panels)), "desk")
 
 
 def chair(x: float, y: float, yaw_deg: float = 0.0) -> Piece:
@@ -105,30 +113,30 @@ def chair(x: float, y: float, yaw_deg: float = 0.0) -> Piece:
     legs = [_beside(seat, ahead, left, 0.015, 0.015) for ahead in (-0.2, 0.2) for left in (-0.2, 0.2)]
     back = _beside(seat, -0.2, 0.0, 0.02, 0.22)
     solids = (Solid(seat, 0.42, 0.46), Solid(back, 0.46, 0.88), *(Solid(leg, 0.0, 0.42) for leg in legs))
-    return Piece(seat, solids)
+    return Piece(seat, solids, "chair")
 
 
 def stool(x: float, y: float) -> Piece:
     """Return a stool, which the planner does not know: a round seat on one leg of 5 cm."""
     seat, leg = Cylinder(x, y, 0.18, mapped=False), Cylinder(x, y, 0.025, mapped=False)
-    return Piece(seat, (Solid(seat, 0.44, 0.48), Solid(leg, 0.0, 0.44)))
+    return Piece(seat, (Solid(seat, 0.44, 0.48), Solid(leg, 0.0, 0.44)), "stool")
 
 
 def round_table(x: float, y: float) -> Piece:
     """Return a round table on one leg, which the planner does not know."""
     top, leg = Cylinder(x, y, 0.35, mapped=False), Cylinder(x, y, 0.04, mapped=False)
-    return Piece(top, (Solid(top, 0.71, 0.74), Solid(leg, 0.0, 0.71)))
+    return Piece(top, (Solid(top, 0.71, 0.74), Solid(leg, 0.0, 0.71)), "round table")
 
 
 def pole(x: float, y: float) -> Piece:
     """Return a coat stand, which the planner does not know: a pole of 5 cm."""
-    return round_block(x, y, 0.025, 1.7)
+    return round_block(x, y, 0.025, 1.7, "pole")
 
 
-def round_block(x: float, y: float, radius_m: float, height_m: float) -> Piece:
+def round_block(x: float, y: float, radius_m: float, height_m: float, name: str = "round block") -> Piece:
     """Return a bin, a plant or a column, which the planner does not know."""
     shape = Cylinder(x, y, radius_m, mapped=False)
-    return Piece(shape, (Solid(shape, 0.0, height_m),))
+    return Piece(shape, (Solid(shape, 0.0, height_m),), name)
 
 
 def block(
@@ -136,7 +144,7 @@ def block(
 ) -> Piece:
     """Return a carton, a cabinet or a sofa."""
     box = _box(x, y, length_m / 2.0, depth_m / 2.0, yaw_deg, mapped)
-    return Piece(box, (Solid(box, 0.0, height_m),))
+    return Piece(box, (Solid(box, 0.0, height_m),), "block")
 
 
 def open_door(x: float, y: float, yaw_deg: float, width_m: float = 0.9) -> Piece:
@@ -144,7 +152,7 @@ def open_door(x: float, y: float, yaw_deg: float, width_m: float = 0.9) -> Piece
     yaw = math.radians(yaw_deg)
     middle = x + math.cos(yaw) * width_m / 2.0, y + math.sin(yaw) * width_m / 2.0
     leaf = _box(*middle, width_m / 2.0, 0.02, yaw_deg, mapped=False)
-    return Piece(leaf, (Solid(leaf, 0.01, DOOR_M),))
+    return Piece(leaf, (Solid(leaf, 0.01, DOOR_M),), "open door")
 
 
 def _box(x: float, y: float, half_x: float, half_y: float, yaw_deg: float, mapped: bool) -> Box:

@@ -1,0 +1,215 @@
+"""What stands between a path and an agent: other waypoints where the way is blocked, and ways out of a standstill.
+
+It knows what an agent knows: ranges, the next two waypoints, velocities. All that it remembers is in the frame of the
+odometry, so a localisation that corrects itself changes nothing.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.deploy.navigation.detour import Place, is_clear, plan_detour
+from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
+from rcdsac_trl.deploy.navigation.watchdog import Watchdog, WatchdogSettings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
+from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.sectors import check_switches
+
+# Places that the robot was at are kept so far apart, and so many of them: for a metre and a half.
+_TRAIL_STEP_M, _TRAIL_PLACES = 0.02, 75
+# What a policy needs to know around the robot: its stop zone reaches no farther.
+_NEARBY_M = 1.5
+# A detour is planned anew after so long, s; its corner gives way to the next within this, m.
+_REPLAN_S, _CORNER_M = 0.4, 0.3
+# Two waypoints nearer to each other are one, the goal.
+_SAME_M = 1e-3
+
+
+@dataclass(frozen=True)
+class NavigatorSettings:
+    """What a navigator does.
+
+    Attributes:
+        replan: hand out the corners of a detour where the way to the next waypoint is blocked.
+        blocked_s: for how long it must have been, s: agents drive around small things by themselves.
+        memory_s: what was seen is forgotten after so long, s.
+        watchdog: when it helps an agent that gets nowhere, and how; None: never.
+
+    Raises:
+        UserInputError: if a value is outside its limits.
+    """
+
+    replan: bool = True
+    blocked_s: float = 1.0
+    memory_s: float = 30.0
+    watchdog: WatchdogSettings | None = field(default_factory=WatchdogSettings)
+
+    def __post_init__(self) -> None:
+        """Refuse what remembers nothing."""
+        check_switches(self, "replan")
+        for name, low in (("blocked_s", 0.0), ("memory_s", 0.1)):
+            if not low <= getattr(self, name) < math.inf:
+                raise UserInputError(f"{name}={getattr(self, name)} of a navigator must be at least {low:g} seconds")
+
+
+class Advice(NamedTuple):
+    """What a navigator makes of an observation.
+
+    Attributes:
+        waypoints: the next two, m, in the robot's frame.
+        boldness: how far beta is to be turned from what was asked for to its boldest, in [0, 1].
+        draws: whether the action is to be drawn instead of its mean.
+        instead: velocities to drive with whatever the agent wants, m/s and rad/s; None: the agent drives.
+        distances_m: what is known of all sectors, those not sensed from memory, float64 [180].
+        been: where the robot has been while it drove ahead, in its frame now, float64 [k, 2], m.
+    """
+
+    waypoints: tuple[Place, Place]
+    boldness: float
+    draws: bool
+    instead: tuple[float, float] | None
+    distances_m: NDArray[np.float64]
+    been: NDArray[np.float64]
+
+
+class Navigator:
+    """Advises one agent; :class:`rcdsac_trl.deploy.Policy` asks it if it is given one.
+
+    Args:
+        settings: what it does.
+        robot: that the agent drives.
+
+    Example:
+        >>> navigator = Navigator(NavigatorSettings(blocked_s=0.0))
+        >>> ranges_m = np.full(180, np.inf)
+        >>> ranges_m[:12] = ranges_m[-2:] = 1.0  # something ahead, more of it to the left
+        >>> ahead = ((2.5, 0.0), (4.0, 0.0))
+        >>> advice = navigator.advise(ranges_m, np.ones(180, bool), ahead, (0.0, 0.0), 0.0)
+        >>> advice.waypoints[0][1] < -0.2  # past it on the right
+        True
+    """
+
+    def __init__(self, settings: NavigatorSettings = NavigatorSettings(), robot: RobotSettings = PAPER) -> None:
+        self.settings = settings
+        self._robot = robot
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the robot was put somewhere else, or has a new task."""
+        nothing = np.zeros(NUM_BINS, np.bool_)
+        max_range_m = self._robot.lidar.max_range_m
+        self._map = LocalMap(LocalMapSettings(memory_s=self.settings.memory_s), nothing, max_range_m)
+        self._tracks = MoverTracks(TrackSettings(), nothing, max_range_m)
+        self._trail: deque[Place] = deque(maxlen=_TRAIL_PLACES)
+        self._blocked_s = self._planned_s = 0.0
+        self._detour: list[Place] = []
+        self._watchdog = None if self.settings.watchdog is None else Watchdog(self.settings.watchdog)
+
+    def advise(
+        self,
+        distances_m: NDArray[np.float64],
+        covered: NDArray[np.bool_],
+        waypoints: tuple[Place, Place],
+        velocity: tuple[float, float],
+        elapsed_s: float,
+    ) -> Advice:
+        """Take in what is known now, and say how to go on.
+
+        Args:
+            distances_m: of the range sensor, by sector, float64 [180], ``inf`` where nothing is.
+            covered: which sectors say something now, bool [180].
+            waypoints: the next two, x and y in m, robot's frame.
+            velocity: measured, m/s and rad/s.
+            elapsed_s: since the last call, 0 at the first, s.
+        """
+        self._observe(distances_m, covered, velocity, elapsed_s)
+        next_two = self._waypoints(waypoints, elapsed_s) if self.settings.replan else waypoints
+        boldness, draws, instead = 0.0, False, None
+        been = self._in_robot(np.array(self._trail))
+        if self._watchdog is not None:
+            target = self._placed(waypoints[0])
+            self._watchdog.observe(self._here, target, elapsed_s)
+            boldness, draws = self._watchdog.boldness, self._watchdog.draws
+            instead = self._watchdog.way_out(self._here, been, next_two[0], elapsed_s)
+        return Advice(next_two, boldness, draws, instead, self._known(distances_m, covered), been)
+
+    @property
+    def _here(self) -> Place:
+        x, y, _ = self._map.pose.tolist()
+        return x, y
+
+    def _observe(
+        self,
+        distances_m: NDArray[np.float64],
+        covered: NDArray[np.bool_],
+        velocity: tuple[float, float],
+        elapsed_s: float,
+    ) -> None:
+        seen_m = np.where(covered, distances_m, np.inf)
+        self._map.sensed = covered
+        self._map.move(*velocity, elapsed_s)
+        self._tracks.observe(seen_m, self._map.pose, elapsed_s, covered)
+        self._map.observe(seen_m, self._tracks.moving)
+        # Only ahead: who backs a little beyond what it knows must not take that as known.
+        ahead = velocity[0] > 0.0 and math.dist(self._trail[-1], self._here) > _TRAIL_STEP_M if self._trail else True
+        if ahead:
+            self._trail.append(self._here)
+
+    def _waypoints(self, waypoints: tuple[Place, Place], elapsed_s: float) -> tuple[Place, Place]:
+        """Return the next two waypoints, of a detour where the way to the first is blocked."""
+        radius_m = self._robot.circumradius_m
+        target, after = self._placed(waypoints[0]), self._placed(waypoints[1])
+        if is_clear(self._map, self._here, target, radius_m):
+            self._blocked_s = 0.0
+            self._detour = []
+            return waypoints
+        self._blocked_s += elapsed_s
+        if self._blocked_s < self.settings.blocked_s:
+            return waypoints
+        self._planned_s += elapsed_s
+        if not self._detour or self._planned_s >= _REPLAN_S:
+            self._detour, self._planned_s = self._planned(target, after), 0.0
+        while len(self._detour) > 1 and math.dist(self._detour[0], self._here) < _CORNER_M:
+            self._detour = self._detour[1:]
+        if not self._detour:
+            return waypoints
+        places = self._in_robot(np.array([*self._detour, after])).tolist()
+        return (places[0][0], places[0][1]), (places[1][0], places[1][1])
+
+    def _planned(self, target: Place, after: Place) -> list[Place]:
+        """Return the corners of a way to the next waypoint, or past it where something stands on it; [] without one."""
+        radius_m = self._robot.circumradius_m
+        corners = plan_detour(self._map, target, radius_m)
+        if not corners and math.dist(target, after) > _SAME_M:
+            corners = plan_detour(self._map, after, radius_m)
+        return corners
+
+    def _known(self, distances_m: NDArray[np.float64], covered: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the distances of all sectors, from memory where they are not sensed."""
+        points = self._map.points[np.isfinite(self._map.points[..., 2])][:, :2]
+        near = self._in_robot(points)
+        apart = np.hypot(near[:, 0], near[:, 1])
+        counts = (apart < _NEARBY_M) & (apart > self._robot.body_radius_m)
+        bins = np.floor(np.arctan2(near[counts, 1], near[counts, 0]) / BIN_RAD).astype(np.intp) % NUM_BINS
+        remembered = np.full(NUM_BINS, np.inf)
+        np.minimum.at(remembered, bins, apart[counts])
+        return np.where(covered, distances_m, remembered)
+
+    def _placed(self, point: Place) -> Place:
+        """Return a point of the robot's frame in that of the odometry."""
+        x, y, yaw = self._map.pose.tolist()
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return x + cos * point[0] - sin * point[1], y + sin * point[0] + cos * point[1]
+
+    def _in_robot(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points [k, 2] of the odometry's frame in the robot's."""
+        x, y, yaw = self._map.pose.tolist()
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        turned: NDArray[np.float64] = (points.reshape(-1, 2) - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+        return turned

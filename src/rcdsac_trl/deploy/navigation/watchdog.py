@@ -1,0 +1,146 @@
+"""Notices that a robot gets nowhere, and what then helps an agent: boldness, chance, and backing off."""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.errors import UserInputError
+
+Place = tuple[float, float]
+
+# A robot that stays so near to where it was stands still.
+_STILL_M = 0.3
+# A robot that came no nearer than this to its waypoint made no progress; another waypoint is another one.
+_PROGRESS_M, _OTHER_WAYPOINT_M = 0.2, 0.5
+# It backs along where it has been, aiming at what lies so far behind it.
+_BACK_AIM_M = 0.25
+# Slower than it may, m/s; and where it cannot back, it turns, rad/s.
+_BACK_M_PER_S, _TURN_RAD_PER_S = -0.15, 0.8
+
+
+@dataclass(frozen=True)
+class WatchdogSettings:
+    """When an agent is helped, and how.
+
+    Attributes:
+        still_s: a robot that stays within 0.3 m for so long is helped, s: then its actions are drawn instead of their
+            mean, and beta begins to turn towards its boldest.
+        stalled_s: so is one that comes no nearer to its waypoint, s: it may be on a detour.
+        bold_s: from then on, beta turns to its boldest within this, s.
+        back_off_s: so long after that begins, the robot backs off, s.
+        back_off_m: by this, m; where it cannot, it turns instead.
+
+    Raises:
+        UserInputError: if a value is not positive.
+    """
+
+    still_s: float = 3.0
+    stalled_s: float = 15.0
+    bold_s: float = 3.0
+    back_off_s: float = 5.0
+    back_off_m: float = 0.4
+
+    def __post_init__(self) -> None:
+        """Refuse what would help at once, or never."""
+        for each in fields(self):
+            if not 0.0 < getattr(self, each.name) < math.inf:
+                raise UserInputError(f"{each.name}={getattr(self, each.name)} of a watchdog must be a positive number")
+
+
+class Watchdog:
+    """Watches one robot.
+
+    Args:
+        settings: when it helps, and how.
+
+    Attributes:
+        idle_s: for how long the robot has been in need of help, s; 0: it is not.
+
+    Example:
+        >>> watchdog = Watchdog(WatchdogSettings())
+        >>> for _ in range(46):
+        ...     watchdog.observe((0.0, 0.0), (3.0, 0.0), 0.1)
+        >>> watchdog.draws, round(watchdog.boldness, 2)
+        (True, 0.5)
+    """
+
+    def __init__(self, settings: WatchdogSettings) -> None:
+        self.settings = settings
+        self.idle_s = 0.0
+        self._anchor: Place | None = None
+        self._still_s = self._stalled_s = 0.0
+        self._waypoint: Place | None = None
+        self._nearest_m = math.inf
+        self._left_m = self._left_s = 0.0
+        self._last: Place | None = None
+        self._side = 1.0
+
+    def observe(self, here: Place, waypoint: Place, elapsed_s: float) -> None:
+        """Take in where the robot is, and where it is to go.
+
+        Args:
+            here: x and y in m, odometry frame.
+            waypoint: the next one, likewise.
+            elapsed_s: since the last call, s.
+        """
+        if self._anchor is None or math.dist(here, self._anchor) > _STILL_M:
+            self._anchor, self._still_s = here, 0.0
+        else:
+            self._still_s += elapsed_s
+        is_other = self._waypoint is None or math.dist(waypoint, self._waypoint) > _OTHER_WAYPOINT_M
+        left_m = math.dist(here, waypoint)
+        if is_other or left_m < self._nearest_m - _PROGRESS_M:
+            self._nearest_m, self._stalled_s = left_m, 0.0
+        else:
+            self._stalled_s += elapsed_s
+        self._waypoint = waypoint
+        settings = self.settings
+        self.idle_s = max(0.0, self._still_s - settings.still_s, self._stalled_s - settings.stalled_s)
+
+    @property
+    def draws(self) -> bool:
+        """Whether actions are to be drawn."""
+        return self.idle_s > 0.0
+
+    @property
+    def boldness(self) -> float:
+        """How far beta is to be turned to its boldest, in [0, 1]."""
+        return min(1.0, self.idle_s / self.settings.bold_s)
+
+    def way_out(
+        self, here: Place, been: NDArray[np.float64], waypoint: Place, elapsed_s: float
+    ) -> tuple[float, float] | None:
+        """Return velocities that lead out, m/s and rad/s; None: the agent may try.
+
+        Args:
+            here: x and y in m, odometry frame.
+            been: where the robot has been, in its frame now, the newest last, [k, 2], m.
+            waypoint: the next one, in its frame, m.
+            elapsed_s: since the last call, s.
+        """
+        moved_m = 0.0 if self._last is None else math.dist(here, self._last)
+        self._last = here
+        if self._left_s <= 0.0:
+            if self.idle_s < self.settings.back_off_s:
+                return None
+            self._left_m = self.settings.back_off_m
+            self._left_s = 2.0 * self._left_m / abs(_BACK_M_PER_S)
+            self._side = 1.0 if waypoint[1] >= 0.0 else -1.0
+        self._left_m -= moved_m
+        self._left_s -= elapsed_s
+        if self._left_m <= 0.0 or self._left_s <= 0.0:
+            self._left_s = self._still_s = self._stalled_s = self.idle_s = 0.0
+            return None
+        back = _aim(been)
+        if back is None:
+            return 0.0, self._side * _TURN_RAD_PER_S
+        x, y = back
+        return _BACK_M_PER_S, _BACK_M_PER_S * 2.0 * y / (x * x + y * y)
+
+
+def _aim(been: NDArray[np.float64]) -> Place | None:
+    """Return the newest place that lies far enough behind; None where there is none."""
+    behind = been[(np.hypot(been[:, 0], been[:, 1]) >= _BACK_AIM_M) & (been[:, 0] < 0.0)]
+    return None if not len(behind) else (float(behind[-1, 0]), float(behind[-1, 1]))

@@ -1,0 +1,100 @@
+"""The navigation around an agent, in a simulation: the same as on a robot, for a whole worker."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from rcdsac_trl.config.navigation_settings import NavigationSettings
+from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
+from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
+from rcdsac_trl.robot.action import action_of
+from rcdsac_trl.robot.observation import range_distances, waypoint_observation, waypoint_positions
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.rollout.policies import AgentNoise
+
+_AT_ORIGIN = (0.0, 0.0, 0.0)
+
+
+def navigator_of(settings: NavigationSettings, robot: RobotSettings) -> Navigator | None:
+    """Make what navigates around an agent; None where nothing is asked for."""
+    if not (settings.replan or settings.watchdog):
+        return None
+    watchdog = WatchdogSettings() if settings.watchdog else None
+    return Navigator(NavigatorSettings(replan=settings.replan, watchdog=watchdog), robot)
+
+
+class NavigatedPolicy(TensorDictModuleBase):
+    """A policy whose agents are advised, each by a navigator of its own.
+
+    Agents are not told how long a step takes: it counts as the middle of the task's periods.
+
+    Args:
+        policy: acts on `waypoint`, and on `risk` if its agents are told one.
+        make: makes a navigator.
+        sensed: which of the 180 sectors the sensor has, bool [180].
+        noise: of the actions that are drawn.
+        boldest: the beta towards which an agent that gets nowhere is turned; None: agents are told none.
+        period_s: of a step, s.
+        robot: that is driven.
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        make: Callable[[], Navigator],
+        sensed: NDArray[np.bool_],
+        noise: AgentNoise,
+        boldest: float | None,
+        period_s: float,
+        robot: RobotSettings = PAPER,
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        self.policy = policy
+        self._navigators = [make() for _ in noise.agent_ids]
+        self._sensed = sensed
+        self._noise = noise
+        self._boldest = boldest
+        self._period_s = period_s
+        self._robot = robot
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write what the policy writes, acting on what the navigators say; observations stay as they were."""
+        asked = tensordict.clone(recurse=False)
+        advice = self._advice(tensordict)
+        waypoints = [waypoint_observation(_AT_ORIGIN, *each.waypoints) for each in advice]
+        asked["waypoint"] = torch.tensor(waypoints, dtype=torch.float32, device="cpu")
+        if self._boldest is not None:
+            boldness = torch.tensor([[each.boldness] for each in advice], dtype=torch.float32, device="cpu")
+            asked["risk"] = tensordict["risk"] + boldness * (self._boldest - tensordict["risk"])
+        asked = self.policy(asked)
+        drawn = torch.tanh(asked["loc"] + asked["scale"] * self._noise.draw())
+        action = asked["action"].clone()
+        for row, each in enumerate(advice):
+            if each.instead is not None:
+                action[row] = torch.tensor(action_of(*each.instead, self._robot), dtype=torch.float32, device="cpu")
+            elif each.draws:
+                action[row] = drawn[row]
+        for key in self.policy.out_keys:
+            tensordict[key] = asked[key]
+        return tensordict.set("action", action)
+
+    def _advice(self, tensordict: TensorDictBase) -> list[Advice]:
+        distances_m = range_distances(tensordict["range"].numpy(), self._robot.lidar.max_range_m)
+        waypoints = waypoint_positions(tensordict["waypoint"].numpy()).tolist()
+        velocities = tensordict["velocity"][:, :2].tolist()
+        begins = tensordict["is_init"][:, 0].tolist()
+        advice = []
+        for row, navigator in enumerate(self._navigators):
+            if begins[row]:
+                navigator.reset()
+            (x, y), (x_after, y_after) = waypoints[row]
+            v, omega = velocities[row]
+            elapsed_s = 0.0 if begins[row] else self._period_s
+            following = (x, y), (x_after, y_after)
+            advice.append(navigator.advise(distances_m[row], self._sensed, following, (v, omega), elapsed_s))
+        return advice

@@ -1,0 +1,231 @@
+"""The navigation around an agent: detours on what was seen, what a watchdog notices, and what a policy makes of it."""
+
+import copy
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rcdsac_trl.deploy import Guard, Policy
+from rcdsac_trl.deploy.navigation.detour import is_clear, plan_detour
+from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
+from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
+from rcdsac_trl.deploy.navigation.watchdog import Watchdog, WatchdogSettings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import clip_command
+from rcdsac_trl.robot.sectors import Sectors
+from rcdsac_trl.world.sim.lidar import sector_distances
+from robots import AHEAD, OPEN, STANDING, agent
+
+ALL = np.ones(180, np.bool_)
+NARROW = (np.arange(180) < 21) | (np.arange(180) >= 158)
+NO_CIRCLES = np.empty((0, 3))
+# A wall across the way, 3 m wide, with its end to the right: the shorter way past it.
+WALL = np.array([[1.5, -0.8, 1.5, 2.2]])
+GOAL = ((3.5, 0.0), (3.5, 0.0))
+AT_ONCE = NavigatorSettings(blocked_s=0.0, watchdog=None)
+
+
+def seen(pose: tuple[float, float, float], segments: np.ndarray = WALL) -> np.ndarray:
+    return sector_distances(*pose, segments, NO_CIRCLES)
+
+
+def in_robot(point: tuple[float, float], pose: tuple[float, float, float]) -> tuple[float, float]:
+    x, y, yaw = pose
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    dx, dy = point[0] - x, point[1] - y
+    return cos * dx + sin * dy, cos * dy - sin * dx
+
+
+# ------------------------------------------------------------------------------------------------ detours
+def test_a_detour_leads_past_the_nearer_end_of_a_wall_and_keeps_clear() -> None:
+    local_map = LocalMap(LocalMapSettings(), ALL)
+    local_map.observe(seen((0.0, 0.0, 0.0)))
+    assert not is_clear(local_map, (0.0, 0.0), (3.5, 0.0), 0.25)
+    assert is_clear(local_map, (0.0, 0.0), (1.0, 0.0), 0.25)
+    corners = plan_detour(local_map, (3.5, 0.0), 0.25)
+    assert corners[-1] == (3.5, 0.0)
+    assert all(y < 0.0 for _, y in corners[:-1])
+    # Cells of 10 cm: the discs that sensed points stand for are passed at the robot's radius, within half a cell.
+    points = local_map.points[np.isfinite(local_map.points[..., 2])][:, :2]
+    for start, end in zip([(0.0, 0.0), *corners], corners, strict=False):
+        assert np.hypot(*(points[:, None] - np.linspace(start, end, 50)).T).min() > 0.19
+
+
+def test_where_nothing_leads_on_there_is_no_detour() -> None:
+    walls = np.array([[1.0, -1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, 1.0, -1.0]])
+    local_map = LocalMap(LocalMapSettings(), ALL)
+    local_map.observe(seen((0.0, 0.0, 0.0), walls))
+    assert plan_detour(local_map, (3.5, 0.0), 0.25) == []
+
+
+def test_waypoints_stay_where_the_way_is_free_or_was_blocked_for_a_moment() -> None:
+    navigator = Navigator(replace(AT_ONCE, blocked_s=0.3))
+    given = ((3.5, 0.0), (6.0, 1.0))
+    assert navigator.advise(OPEN, ALL, given, (0.0, 0.0), 0.0).waypoints == given
+    told = [navigator.advise(seen((0.0, 0.0, 0.0)), ALL, given, (0.0, 0.0), 0.14).waypoints for _ in range(4)]
+    assert [each == given for each in told] == [True, True, False, False]
+    assert navigator.advise(np.full(180, 3.9), ALL, given, (0.0, 0.0), 0.14).waypoints == given  # it was seen through
+
+
+def test_a_follower_of_the_waypoints_gets_past_a_wall_that_it_would_drive_into() -> None:
+    def ends(navigator: Navigator) -> tuple[float, float]:
+        """Drive to the first waypoint, all that the driver knows; return gap to the goal and least to a wall."""
+        x = y = yaw = v = omega = 0.0
+        nearest = math.inf
+        for step in range(250):
+            pose = (x, y, yaw)
+            goal = in_robot(GOAL[0], pose)
+            ranges = np.where(NARROW, seen(pose), np.inf)
+            advice = navigator.advise(ranges, NARROW, (goal, goal), (v, omega), 0.14 if step else 0.0)
+            bearing = math.atan2(*advice.waypoints[0][::-1])
+            wish = 0.4 * max(0.0, math.cos(bearing)), max(-1.5, min(1.5, 3.0 * bearing))
+            for _ in range(7):
+                v, omega = clip_command(*wish, v, omega)
+                yaw += omega * 0.02
+                x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
+            nearest = min(nearest, float(sector_distances(x, y, 0.0, WALL, NO_CIRCLES).min()))
+            if math.dist((x, y), GOAL[0]) < 0.3:
+                break
+        return math.dist((x, y), GOAL[0]), nearest
+
+    gap_m, nearest_m = ends(Navigator(AT_ONCE))
+    assert gap_m < 0.3
+    assert nearest_m > 0.2
+    assert ends(Navigator(replace(AT_ONCE, replan=False)))[1] < 0.05
+
+
+def test_what_is_out_of_view_is_told_to_the_stop_zone() -> None:
+    navigator = Navigator(replace(AT_ONCE, replan=False))
+    beside = np.array([[0.2, 0.5, 1.2, 0.5]])  # left of the way
+    for step in range(9):
+        x = 0.07 * step
+        ranges = np.where(NARROW, seen((x, 0.0, 0.0), beside), np.inf)
+        # From rest, reckoned along the mean of two velocities: it is given the same one from the first call on.
+        advice = navigator.advise(ranges, NARROW, GOAL, (0.5, 0.0), 0.14 if step else 0.0)
+    there = advice.distances_m[44:46]  # 88 to 92 degrees, where no sector sees
+    assert np.isfinite(there).any()
+    assert there.min() == pytest.approx(0.5, abs=0.06)
+    assert np.isinf(advice.distances_m[120])
+    assert advice.been[0] == pytest.approx((-x, 0.0), abs=0.1)
+
+
+# ------------------------------------------------------------------------------------------------ standstill
+SETTINGS = WatchdogSettings(still_s=2.0, stalled_s=6.0, bold_s=2.0, back_off_s=3.0, back_off_m=0.4)
+
+
+def test_a_standstill_makes_bold_then_draws_then_backs_off_and_begins_anew() -> None:
+    dog = Watchdog(SETTINGS)
+    been = np.column_stack([np.linspace(-1.0, 0.0, 51), np.zeros(51)])
+    told = []
+    for _ in range(60):
+        dog.observe((0.0, 0.0), (5.0, 0.0), 0.1)
+        told.append((dog.draws, round(dog.boldness, 2), dog.way_out((0.0, 0.0), been, (2.0, 0.0), 0.1)))
+    assert told[19] == (False, 0.0, None)
+    assert told[30] == (True, 0.5, None)
+    assert told[45] == (True, 1.0, None)
+    assert told[52][2] == pytest.approx((-0.15, 0.0))
+    for step in range(8):  # it moves
+        way = dog.way_out((-0.06 * step, 0.0), been, (2.0, 0.0), 0.1)
+    assert way is None
+    assert (dog.draws, dog.boldness) == (False, 0.0)
+
+
+def test_who_cannot_back_turns_towards_the_waypoint() -> None:
+    for side in (-1.0, 1.0):
+        dog = Watchdog(SETTINGS)
+        for _ in range(60):
+            dog.observe((0.0, 0.0), (5.0, 0.0), 0.1)
+        way = dog.way_out((0.0, 0.0), np.zeros((1, 2)), (-1.0, side), 0.1)
+        assert way == (0.0, side * 0.8)
+
+
+def test_going_to_and_fro_without_progress_is_a_standstill_too() -> None:
+    dog = Watchdog(SETTINGS)
+    for step in range(90):
+        dog.observe((math.sin(step / 5.0), 0.0), (5.0, 0.0), 0.1)
+    assert dog.idle_s > 0.5
+    dog.observe((0.0, 0.0), (5.0, 3.0), 0.1)  # another waypoint
+    assert dog.idle_s == 0.0
+
+
+def test_it_backs_along_the_arc_that_it_came_by() -> None:
+    angles = np.linspace(-1.0, 0.0, 60)
+    been = np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])  # on a circle around (0, 1), counter-clockwise
+    dog = Watchdog(SETTINGS)
+    for _ in range(60):
+        dog.observe((0.0, 0.0), (5.0, 0.0), 0.1)
+    v, omega = dog.way_out((0.0, 0.0), been, (2.0, 0.0), 0.1) or (0.0, 0.0)
+    assert v < 0.0
+    assert omega / v == pytest.approx(1.0, rel=0.02)  # the curvature of that circle
+
+
+# ------------------------------------------------------------------------------------------------ the policy
+def policy(**options: Any) -> Policy:
+    return Policy(agent(), navigator=Navigator(NavigatorSettings(watchdog=SETTINGS)), **options)
+
+
+def drive(driver: Policy, steps: int, beta: float = -1.5) -> list[Any]:
+    return [driver.act(OPEN, AHEAD, STANDING, beta) for _ in range(steps)]
+
+
+def test_a_policy_turns_bold_draws_and_backs_off_where_it_stands_and_then_drives_as_before() -> None:
+    still, plain = policy(guard=None), Policy(agent(), guard=None)
+    told, untouched = drive(still, 45), drive(plain, 45)
+    # 2 s are 14 periods of 0.14 s: until then nothing is changed.
+    assert [each.wanted for each in told[:14]] == [each.wanted for each in untouched[:14]]
+    assert len({each.wanted for each in told[20:30]}) == 10  # drawn
+    assert len({round(each.wanted[0], 5) for each in untouched[20:30]}) < 10
+    turning = [each for each in told if each.reason is not None]
+    assert turning
+    assert "backs off" in turning[0].reason
+    assert turning[0].v_m_per_s == 0.0  # it has been nowhere else, so it turns
+
+
+def test_an_advised_policy_repeats_and_copies() -> None:
+    first = policy(guard=None)
+    drive(first, 25)
+    copied = copy.copy(first)
+    assert [each.wanted for each in drive(copied, 5)] == [each.wanted for each in drive(first, 5)]
+    first.reset()
+    again = policy(guard=None)
+    assert [each.wanted for each in drive(first, 20)] == [each.wanted for each in drive(again, 20)]
+
+
+def test_the_stop_zone_minds_what_the_navigator_remembers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Something that was seen ahead and is beside the robot once it has turned, where no sector sees."""
+    told: list[np.ndarray] = []
+
+    def limit(_: Guard, v: float, omega: float, sectors: Sectors, *__: Any) -> tuple[float, float, None]:
+        told.append(sectors.distances_m)
+        return v, omega, None
+
+    monkeypatch.setattr(Guard, "limit", limit)
+    for driver in (policy(), Policy(agent())):
+        told.clear()
+        thing = np.array([[0.6, -0.1, 0.6, 0.1]])
+        for step in range(12):
+            yaw = min(step * 0.14, 1.4)
+            ranges = Sectors(np.where(NARROW, seen((0.0, 0.0, yaw), thing), np.inf), NARROW)
+            driver.act(ranges, AHEAD, (0.0, 1.0 if yaw < 1.4 else 0.0), -1.0)
+        behind = told[-1][130:145]
+        assert np.isfinite(behind).any() == (driver.navigator is not None)
+    assert np.isinf(told[-1][~NARROW]).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "bad"),
+    [
+        (NavigatorSettings, {"blocked_s": -1.0}),
+        (NavigatorSettings, {"memory_s": math.nan}),
+        (NavigatorSettings, {"replan": "no"}),
+        (WatchdogSettings, {"still_s": 0.0}),
+        (WatchdogSettings, {"back_off_m": math.inf}),
+    ],
+    ids=str,
+)
+def test_what_navigates_nowhere_is_refused(make: Any, bad: dict[str, Any]) -> None:
+    with pytest.raises(UserInputError, match=f"{next(iter(bad))}="):
+        make(**bad)

@@ -1,0 +1,108 @@
+"""Navigators around the agents of a worker: what the policy is told, what is done, and an evaluation with them."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from rcdsac_trl.config.navigation_settings import NavigationSettings
+from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
+from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.observation import range_observation, waypoint_observation, waypoint_positions
+from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.robot.robot_settings import PAPER
+from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
+from rcdsac_trl.rollout.policies import AgentNoise
+from rcdsac_trl.world.sim.lidar import sector_distances
+from tiny import evaluate, untrained_run
+
+FULL = sensor_mask("full")
+WALL = np.array([[1.5, -0.8, 1.5, 2.2]])
+AHEAD = (3.5, 0.0), (6.0, 0.0)
+
+
+class Told(TensorDictModuleBase):
+    """Keeps what it is told, and stands."""
+
+    in_keys = ["range", "waypoint", "velocity", "risk"]  # noqa: RUF012
+    out_keys = ["loc", "scale", "action"]  # noqa: RUF012
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waypoints: list[np.ndarray] = []
+        self.risks: list[list[float]] = []
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.waypoints.append(waypoint_positions(tensordict["waypoint"].numpy()))
+        self.risks.append(tensordict["risk"][:, 0].tolist())
+        stand = torch.tensor([[-0.5, 0.0]]).expand(tensordict.batch_size[0], -1)
+        return tensordict.update({"loc": torch.atanh(stand), "scale": torch.full_like(stand, 0.1), "action": stand})
+
+
+def observation(begins: bool) -> TensorDict:
+    """Two agents with the same waypoints: before the first is a wall, before the second nothing."""
+    ranges = [sector_distances(0.0, 0.0, 0.0, WALL, np.empty((0, 3))), np.full(180, np.inf)]
+    seen = np.stack([range_observation(each, FULL) for each in ranges])
+    waypoint = torch.tensor([waypoint_observation((0.0, 0.0, 0.0), *AHEAD)] * 2, dtype=torch.float32)
+    told = {"range": torch.from_numpy(seen), "waypoint": waypoint, "velocity": torch.zeros(2, 4)}
+    init = torch.full((2, 1), begins, dtype=torch.bool)
+    return TensorDict({**told, "risk": torch.tensor([[0.2], [0.2]]), "is_init": init}, [2])
+
+
+def navigated(settings: NavigatorSettings) -> tuple[Told, NavigatedPolicy]:
+    inner, noise = Told(), AgentNoise([0, 1])
+    noise.begin(0, "test")
+    make = partial(Navigator, settings)
+    return inner, NavigatedPolicy(inner, make, FULL, noise, 1.0, 0.14, PAPER)
+
+
+def test_an_agent_is_told_a_detour_where_its_way_is_blocked_and_the_observation_stays() -> None:
+    inner, policy = navigated(NavigatorSettings(blocked_s=0.2, watchdog=None))
+    for step in range(4):
+        given = observation(step == 0)
+        after = policy(given.clone())
+        assert torch.equal(after["waypoint"], given["waypoint"])
+        assert torch.equal(after["risk"], given["risk"])
+        assert after["action"].tolist() == [[-0.5, 0.0]] * 2
+    blocked = [told[0, 0, 1] < -0.5 for told in inner.waypoints]  # past the end of the wall on the right
+    assert blocked == [False, False, True, True]
+    for told in inner.waypoints:
+        np.testing.assert_allclose(told[1], AHEAD, atol=1e-4)
+
+
+def test_an_agent_that_stands_is_made_bold_and_then_backs_off_or_turns() -> None:
+    dog = WatchdogSettings(still_s=0.5, bold_s=1.0, back_off_s=1.5)
+    inner, policy = navigated(NavigatorSettings(replan=False, watchdog=dog))
+    actions = [policy(observation(step == 0))["action"].tolist() for step in range(25)]
+    risks = [told[1] for told in inner.risks]
+    assert risks[:4] == pytest.approx([0.2] * 4)
+    assert risks[-1] == pytest.approx(1.0)
+    assert risks == sorted(risks)
+    assert actions[3][1] == [-0.5, 0.0]
+    assert len({tuple(action[1]) for action in actions[5:12]}) == 7  # drawn
+    assert actions[-1][1] == pytest.approx((-0.5, 0.8 / PAPER.max_angular_velocity))  # 0 m/s: it has been nowhere
+    policy(observation(True))
+    assert inner.risks[-1] == pytest.approx([0.2] * 2)  # a new episode begins afresh
+
+
+def test_an_evaluation_with_navigation_repeats_and_says_so(tmp_path: Path) -> None:
+    run, _, _ = untrained_run(tmp_path / "run", "rcdsac_cvar")
+    asked = [f"run={run}", "checkpoint=last", "beta=[0.25]", "navigation.replan=true", "navigation.watchdog=true"]
+    first, again = (evaluate(*asked, f"out={tmp_path / name}") for name in ("a", "b"))
+    pd.testing.assert_frame_equal(*(pd.read_csv(out / "episodes.csv") for out in (first, again)))
+    assert '"watchdog": true' in (first / "evaluation.json").read_text()
+    with pytest.raises(UserInputError, match="baseline=dwa navigates by itself"):
+        evaluate("baseline=dwa", "navigation.watchdog=true")
+
+
+def test_nothing_navigates_unless_it_is_asked_for() -> None:
+    assert navigator_of(NavigationSettings(), PAPER) is None
+    made = navigator_of(NavigationSettings(replan=True), PAPER)
+    assert made is not None
+    assert (made.settings.replan, made.settings.watchdog) == (True, None)
