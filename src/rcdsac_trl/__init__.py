@@ -35,6 +35,8 @@ from rcdsac_trl.world.task import gymnasium_id
 if TYPE_CHECKING:
     from rcdsac_trl.deploy import Policy
 
+__version__ = "0.1.0"
+
 
 def load(name_or_folder: str | Path, **options: Any) -> "Policy":
     """Return a trained agent that drives a robot.
