@@ -1,6 +1,7 @@
 """The object that drives: observations in, a velocity command and the risk of it out, one call a control period."""
 
 import copy
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from rcdsac_trl.deploy.policy.input_checks import (
     velocity_of,
     waypoints_of,
 )
+from rcdsac_trl.deploy.policy.observed import observed
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
 from rcdsac_trl.deploy.sensors.sectors import Sectors, is_finite_number, is_whole_number
@@ -142,12 +144,70 @@ class Policy:
         self._last_fresh: Stamps | None = None
         self._wanted: tuple[float, float] | None = None
         self._told: tuple[NDArray[np.float32] | None, float] | None = None
+        self._others: list[Policy] = []
 
     def __copy__(self) -> "Policy":
         """Copy the situation, and share what never changes."""
         copied = object.__new__(type(self))
-        copied.__dict__ |= self.__dict__ | {"_remembered": copy.deepcopy(self._remembered)}
+        own = {"_remembered": copy.deepcopy(self._remembered), "_others": [copy.copy(other) for other in self._others]}
+        copied.__dict__ |= self.__dict__ | own
         return copied
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """What the agent was trained to see with and drive, as an environment takes it: sensor, memory and robot."""
+        return {"sensor": self.config.sensor, "memory_s": self.config.memory_s, "robot": self.robot}
+
+    def act_on(
+        self, observation: Any, beta: float | None = None, *, collision_weight: float | None = None
+    ) -> NDArray[np.float32]:
+        """Return the action for an observation of the Gymnasium or the TorchRL environment.
+
+        Call it once in every step. It does what :meth:`act` does for a robot, without guard, :meth:`stop` and the
+        checks of what a robot's sensors say. Call :meth:`reset` when an episode begins; a TorchRL environment with an
+        ``InitTracker`` says so itself.
+
+        Args:
+            observation: what the environment returned, a dict or a TensorDict, of one agent or of many: each has a
+                memory of its own.
+            beta: as in :meth:`act`.
+            collision_weight: as in :meth:`act`.
+
+        Returns:
+            float32 [2], each in [-1, 1]; [N, 2] of N agents.
+
+        Raises:
+            UserInputError: if the observation is of another sensor or memory than the agent's, or :meth:`act` would
+                refuse `beta` or `collision_weight`.
+
+        Example:
+            >>> import gymnasium, rcdsac_trl
+            >>> policy = rcdsac_trl.load("rcdsac_pow-narrow")
+            >>> env = gymnasium.make("RCDSACNavigation-v0", map="easy", **policy.world)
+            >>> observation, _ = env.reset(seed=0)
+            >>> policy.act_on(observation, beta=-1.0).shape
+            (2,)
+        """
+        seen = observed(observation, self.config)
+        try:
+            context = self._context(beta, collision_weight)
+        except BadInputError as error:
+            raise UserInputError(str(error)) from None
+        agents = self._agents(len(seen.bins))
+        for agent in np.flatnonzero(seen.begins):
+            agents[agent]._forget()
+        actions = [
+            agent._see(bins, vectors, context).action
+            for agent, bins, vectors in zip(agents, seen.bins, seen.vectors, strict=True)
+        ]
+        return np.array(actions, dtype=np.float32).reshape(*seen.batch, 2)
+
+    def _agents(self, number: int) -> "list[Policy]":
+        """Return this one and others with memories of their own, which are there until a :meth:`reset`."""
+        if len(self._others) != number - 1:
+            self.reset()
+            self._others = [copy.copy(self) for _ in range(number - 1)]
+        return [self, *self._others]
 
     def foresee(self, beta: float | None = None, *, action: Any = None) -> Outlook:
         """Return what the agent would do with another `beta` where it stands now, and what it expects of that.
@@ -287,18 +347,21 @@ class Policy:
         context: float | None,
         elapsed_s: float,
     ) -> None:
-        config = self.config
         bins = range_observation(sectors.distances_m, self._mask, self.robot.lidar.max_range_m)
         vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
         if self._remembered is not None:
             vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
-        if config.context == "collision_weight" and context is not None:
-            vectors.append(context)
-        self._states = self._encoders.step(bins, np.array(vectors, dtype=np.float32), self._states)
+        self._see(bins, vectors, context)
+
+    def _see(self, bins: Array, vectors: Sequence[float] | Array, context: float | None) -> Outlook:
+        """Let the networks take a step, and return what they want and expect."""
+        told = (context,) if self.config.context == "collision_weight" and context is not None else ()
+        self._states = self._encoders.step(bins, np.array((*vectors, *told), dtype=np.float32), self._states)
         self._steps += 1
         outlook = self._outlook(self._embedded(context))
         self._wanted = outlook.wanted
         self._told = outlook.quantiles, outlook.value
+        return outlook
 
     def _embedded(self, context: float | None) -> float | None:
         """Return what the heads are told; None where they are told nothing."""
