@@ -116,20 +116,34 @@ def _initialized() -> AbstractContextManager[None]:
 
 
 def with_sections(config_name: str, overrides: list[str]) -> list[str]:
-    """Let a key of a section that is null until it is chosen change that section, where the root takes a part of one.
+    """Complete overrides by what they imply.
+
+    A key of a section that is null until it is chosen changes that section, where the root takes a part of one.
 
     `evaluate` completes ``task.episode_steps=200`` with the task that the agent was trained for; Hydra alone would want
-    a plus before it.
+    a plus before it. `train` takes row, sensor, robot and networks of the agent that ``init`` names.
 
     Example:
         >>> with_sections("evaluate", ["run=a", "task.episode_steps=200"])
         ['run=a', '+task.episode_steps=200']
     """
+    if config_name == "train":
+        return _with_init(overrides)
     if config_name != "evaluate":
         return overrides
     chosen = {key_of(override) for override in overrides}
     absent = {group for group, option in root_groups(config_name).items() if option is None} - chosen
     return [f"+{o}" if o.partition(".")[0] in absent else o for o in overrides]
+
+
+def _with_init(overrides: list[str]) -> list[str]:
+    """Let a training that begins with an agent be of that agent's kind."""
+    named = [override.partition("=")[2].strip("'\"") for override in overrides if key_of(override) == "init"]
+    if not named or named[-1] in ("", "null") or "," in named[-1]:
+        return overrides
+    from rcdsac_trl.config.warm_start import with_the_agents_own  # late: it reads what it names through this module
+
+    return with_the_agents_own(named[-1], overrides)
 
 
 def root_groups(config_name: str) -> dict[str, str | None]:
