@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # After so many calls without good input in a row, or so many of the longest periods of training without one, the memory
 # is of another situation.
 _FORGET_AFTER = 3
-_RECOVERS = "it drives on with the next good input"
+_RECOVERS = "it stands until good input comes"
 _AT_ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -48,6 +48,12 @@ def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
     if not (is_whole_number(num_quantiles) and num_quantiles >= 1):
         raise UserInputError(f"num_quantiles={num_quantiles} is no whole number of 1 or more: ask for at least one")
     return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
+
+
+def _span(values: Sequence[float], digits: int) -> str:
+    """Write the smallest and the largest of some numbers, or the only one."""
+    low, high = (f"{value:.{digits}f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
 
 
 def _memory_of(memory_s: float, sensed: NDArray[np.bool_], robot: RobotSettings) -> "RememberedRanges | None":
@@ -93,6 +99,7 @@ class Policy:
     Attributes:
         config: what the agent is.
         robot: that it drives.
+        record: what its card says of how it drives; empty where it says nothing.
         fractions: of the quantiles, the midpoints of equal parts of [0, 1], float32 [N].
         default_beta: what ``beta`` is where none is given, the middle of the trained range (-1 for the power law);
             None for an agent that is told none.
@@ -110,6 +117,7 @@ class Policy:
         num_quantiles: int = 16,
     ) -> None:
         self.config = weights.config
+        self.record = weights.record
         self.robot = self.config.robot
         self.guard = _guard_of(self.robot, guard)
         self.limits = limits
@@ -145,6 +153,22 @@ class Policy:
         self._wanted: tuple[float, float] | None = None
         self._told: tuple[NDArray[np.float32] | None, float] | None = None
         self._others: list[Policy] = []
+
+    def __repr__(self) -> str:
+        """Say what the agent is, and what its card says of how it drives."""
+        config = self.config
+        parts = [config.name, f"sensor {config.sensor}"]
+        if config.memory_s > 0.0:
+            parts.append(f"remembers {config.memory_s:g} s")
+        if config.context is not None and config.context_range is not None:
+            parts.append(f"{config.context} in [{config.context_range[0]:g}, {config.context_range[1]:g}]")
+        elif config.fixed_beta is not None:
+            parts.append(f"for beta={config.fixed_beta:g} alone")
+        parts.append(f"robot {self.robot.name}")
+        if self.record:
+            collisions, rewards = [r.collisions for r in self.record], [r.reward for r in self.record]
+            parts.append(f"an episode: collisions {_span(collisions, 2)}, reward {_span(rewards, 0)}")
+        return f"Policy({', '.join(parts)})"
 
     def __copy__(self) -> "Policy":
         """Copy the situation, and share what never changes."""
