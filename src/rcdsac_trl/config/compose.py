@@ -141,7 +141,7 @@ def _with_init(overrides: list[str]) -> list[str]:
     named = [override.partition("=")[2].strip("'\"") for override in overrides if key_of(override) == "init"]
     if not named or named[-1] in ("", "null") or "," in named[-1]:
         return overrides
-    from rcdsac_trl.config.warm_start import with_the_agents_own  # late: it reads what it names through this module
+    from rcdsac_trl.config.init_overrides import with_the_agents_own  # late: it reads what it names through this module
 
     return with_the_agents_own(named[-1], overrides)
 

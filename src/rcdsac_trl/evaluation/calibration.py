@@ -66,7 +66,10 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
     loss = named.load_critics()
     processes = resolve_processes(settings.num_workers, settings.num_maps)
     simulations = max(1, processes) * len(conditions) * settings.num_states * settings.num_rollouts
-    remedy = "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, or end other programs"
+    remedy = (
+        "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, give fewer values of beta, or end "
+        "other programs"
+    )
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
 
     def maps(watch: Watch) -> Generator[Rows, None, None]:
