@@ -61,9 +61,9 @@ def _run(trainer: "Trainer") -> None:
 def _lead_on(folder: Path) -> None:
     """Say what to do with a finished run, in lines to be copied."""
     from rcdsac_trl.config.command_line import assigned
-    from rcdsac_trl.system.invocation import program
+    from rcdsac_trl.system.invocation import from_here, program
 
-    run = assigned("run", folder.as_posix())
+    run = assigned("run", from_here(folder))
     print(f"next: {program()} evaluate {run}\n      {program()} plot_training {run}")
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rcdsac_trl.system.invocation import program
+from rcdsac_trl.system.invocation import from_here, program
 
 
 @pytest.fixture
@@ -43,3 +43,12 @@ def test_a_script_that_the_shell_finds_is_named_alone(python: Path, monkeypatch:
     script(python.parent)
     monkeypatch.setenv("PATH", str(python.parent))
     assert program() == "rcdsac-trl"
+
+
+def test_paths_are_written_from_where_one_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert [from_here(tmp_path / "runs" / "a"), from_here("runs/a"), from_here(tmp_path.parent)] == [
+        "runs/a",
+        "runs/a",
+        str(tmp_path.parent),
+    ]

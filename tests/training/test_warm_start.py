@@ -17,6 +17,7 @@ from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.storage.checkpoint_record import load_progress
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.setup import make_trainer, resume_training
 from rcdsac_trl.training.trainer import Trainer
 from tiny import TINY
@@ -117,7 +118,9 @@ def test_it_trains_and_is_continued_also_where_the_agent_is_gone(
     call = [f"init={agent}", *TINY, "hydra.run.dir=run"]
     monkeypatch.setattr(sys, "argv", ["train", *call])
     train.main()
-    assert "next: " in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"next: {program()} evaluate run=run\n" in told
+    assert f"{program()} plot_training run=run\n" in told
     assert load_progress(Path("run/checkpoints"), "last").updates == tiny.UPDATES * tiny.ITERATIONS
     assert json.loads(Path("run/manifest.json").read_text())["overrides"][0].startswith("++algo.name=")
     shutil.rmtree(agent)

@@ -42,4 +42,6 @@ def _words(verb: str) -> Iterator[str]:
         for group in root_groups(root):
             plus = "+" if group == "algo" else ""
             yield from (f"{plus}{group}={option}" for option in choices(group))
-    yield from (f"{key}=" for key in all_keys(verb))
+    keys = all_keys(verb)
+    sections = {key.rpartition(".")[0] for key in keys}
+    yield from (f"{key}=" for key in keys if key not in sections)
