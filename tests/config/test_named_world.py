@@ -1,6 +1,7 @@
 """Environments by the names of conf/: the same settings as the command line takes."""
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import pytest
@@ -11,6 +12,7 @@ from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.task.gymnasium_env import NavigationGymEnv
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 ENV_ID = "RCDSACNavigation-v0"
@@ -24,11 +26,19 @@ def test_names_are_those_of_the_command_line() -> None:
     assert rcdsac_trl.world_settings() == WorldSettings()
 
 
-def test_gymnasium_makes_what_is_named() -> None:
+def test_gymnasium_makes_what_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+
+    class Watched(NavigationGymEnv):
+        def __init__(self, world: WorldSettings | None = None, **options: Any) -> None:
+            given.update(options)
+            super().__init__(world, **options)
+
+    monkeypatch.setattr("rcdsac_trl.config.named_world.NavigationGymEnv", Watched)
     env = gymnasium.make(ENV_ID, map="easy", robot="turtlebot3_burger", sensor="full")
-    agents = env.unwrapped._agents  # type: ignore[attr-defined]
-    assert agents.robot.name == "turtlebot3_burger"
-    assert agents.robot == rcdsac_trl.world_settings(robot="turtlebot3_burger").robot
+    named = rcdsac_trl.world_settings(map="easy", robot="turtlebot3_burger")
+    assert (given["map_settings"], given["robot"]) == (named.map_settings, named.robot)
+    assert (named.robot.name, given["sensor"]) == ("turtlebot3_burger", "full")
     assert env.spec is not None
     again = gymnasium.make(env.spec)  # as vector environments do
     assert again.reset(seed=1)[0].keys() == env.reset(seed=1)[0].keys()
