@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import InitTracker, StepCounter, TransformedEnv
+from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
 
 import rcdsac_trl
 from rcdsac_trl.deploy import Policy
@@ -119,7 +119,7 @@ def test_both_environments_are_driven_alike() -> None:
     """With what is remembered and another robot; the agent of TorchRL has companions, and two episodes."""
     policy = Policy(agent(memory_s=9.0, sensor="full"))
     world = rcdsac_trl.world_settings(map="easy", num_agents=2, **policy.world)
-    several = TransformedEnv(NavigationEnv(world, seed=3), InitTracker(), StepCounter(max_steps=5))
+    several = TransformedEnv(NavigationEnv(world, seed=3), Compose(InitTracker(), StepCounter(max_steps=5)))
     rollout = several.rollout(
         10, lambda td: td.set("action", torch.from_numpy(policy.act_on(td, beta=-1.0))), break_when_any_done=False
     )

@@ -30,10 +30,13 @@ def settings(*overrides: str) -> TrainingSettings:
 
 
 def begun(agent: str | Path, folder: Path, *overrides: str) -> Trainer:
-    trainer = make_trainer(compose("train", [f"init={agent}", *TINY, *overrides]), folder)
-    trainer.episodes.close()
-    trainer.validation.close()
-    trainer.lock.close()
+    return closed(make_trainer(compose("train", [f"init={agent}", *TINY, *overrides]), folder))
+
+
+def closed(trainer: Trainer) -> Trainer:
+    """End what a trainer holds open, as a run does; what it holds in memory stays."""
+    for held in (trainer.episodes, trainer.validation, trainer.log, trainer.lock):
+        held.close()
     return trainer
 
 
@@ -130,13 +133,10 @@ def test_it_trains_and_is_continued_also_where_the_agent_is_gone(
 
 
 def test_a_run_that_saved_nothing_begins_with_the_agent_again(tiny_run: Path, tmp_path: Path) -> None:
-    begun(tiny_run, tmp_path / "run").log.close()
+    begun(tiny_run, tmp_path / "run")
     trainer = resume_training(tmp_path / "run")
     assert trainer is not None
-    assert_equal_states(trainer.learner.loss, named_agent(tiny_run, "last").load()[0])
-    trainer.episodes.close()
-    trainer.validation.close()
-    trainer.lock.close()
+    assert_equal_states(closed(trainer).learner.loss, named_agent(tiny_run, "last").load()[0])
 
 
 def test_an_exported_agents_average_stands_for_what_it_lacks(tiny_run: Path, tmp_path: Path) -> None:
