@@ -13,19 +13,21 @@ BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job 
 WORKERS ?= logical
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: setup train smoke play test test-slow chromium check format bench notebooks clean
+.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks clean
 
-train: setup
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F '|' '{ printf "%-16s %s\n", $$1, $$2 }'
+
+train: setup ## train a risk-conditioned agent: two cores, about an hour
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
 
-smoke: setup
+smoke: setup ## rehearse the whole training in under a minute; it learns nothing
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow preset=smoke
 
-# A page on which a robot drives while you turn beta; Ctrl-C ends it.
-play: setup
+play: setup ## drive a shipped agent on a page in your browser; Ctrl-C ends it
 	$(BIN)/python -m rcdsac_trl.play
 
-test: setup chromium
+test: setup chromium ## run the tests
 	$(PYTEST)
 
 # Tests of the page open it in the system's Chromium. Where that is missing and may not be installed, they skip.
@@ -37,26 +39,25 @@ chromium:
 	echo "To run them too: sudo apt-get install chromium"
 
 # One after another: they start clusters of their own, and count on the cores.
-test-slow: test
+test-slow: test ## run those that take minutes as well
 	$(BIN)/python -m pytest -m slow
 
-bench: setup
+bench: setup ## measure how fast it is
 	for name in $(BENCHMARKS); do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
-check: setup
+check: setup ## look for mistakes of style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# Run the notebooks anew, in place.
-notebooks: setup
+notebooks: setup ## run the notebooks anew, in place
 	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
-format: setup
+format: setup ## let ruff repair what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-setup: $(VENV)/.complete
+setup: $(VENV)/.complete ## make .venv with everything; every other target does it by itself
 
 $(VENV)/.complete: pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing: install Python 3.11, or name it with make PYTHON=/path/to/python"; exit 2; }
@@ -65,5 +66,5 @@ $(VENV)/.complete: pyproject.toml constraints.txt
 	$(INSTALL) -e '.[dev]'
 	@touch $@
 
-clean:
+clean: ## remove .venv and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache

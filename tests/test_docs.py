@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 from rcdsac_trl import draw_maps
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.config.verbs import VERBS
 from rcdsac_trl.experiments.optuna_search import make_search
 from rcdsac_trl.experiments.sweep_jobs import make_sweep
 from rcdsac_trl.training.setup import check_training
@@ -95,20 +96,7 @@ def test_commands_are_accepted(verb: str, arguments: str, monkeypatch: pytest.Mo
 
 def test_there_are_commands_of_every_verb() -> None:
     verbs = {text.split()[0] for _, text in texts(r"python -m rcdsac_trl\.(\w+ [^\n`]+)")}
-    assert verbs == {
-        "train",
-        "evaluate",
-        "calibrate",
-        "report",
-        "export",
-        "plot_training",
-        "draw_maps",
-        "search",
-        "course",
-        "publish",
-        "replay",
-        "play",
-    }
+    assert verbs == set(VERBS)
 
 
 @pytest.mark.parametrize(("name", "target"), texts(r"\]\((?!https?:)([^)#]+)"))

@@ -53,3 +53,11 @@ def test_it_runs_and_shows_what_was_saved(name: str) -> None:
     # Raises the cell's error, should there be one.
     NotebookClient(executed, timeout=600, resources={"metadata": {"path": str(FOLDER)}}).execute()
     assert figures(executed) == figures(saved) > 0
+
+
+def test_outside_the_checkout_the_second_names_what_it_misses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notebook = nbformat.read(FOLDER / "2_from_runs_to_the_table.ipynb", as_version=4)
+    first = next(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"^there is no results/ here: .* or set RESULTS to a folder"):
+        exec("\n".join(line for line in first.splitlines() if not line.startswith("%")), {})

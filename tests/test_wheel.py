@@ -2,15 +2,21 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import zipfile
+from email import message_from_string
+from email.message import Message
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import yaml
+
+import rcdsac_trl
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (
@@ -77,6 +83,77 @@ def test_the_wheel_holds_the_configuration_and_no_leftovers(installed: Path) -> 
     kinds = {".py", ".yaml", ".typed", ".csv", ".json", ".safetensors", ".md", ".html", ".css", ".js"}
     assert {Path(name).suffix for name in names if name.startswith("rcdsac_trl/")} == kinds
     assert "rcdsac_trl/report/paper.csv" in names
+
+
+# What drives a robot: all else of the package's dependencies is kept from it.
+BARE = ("numpy", "safetensors")
+DRIVE = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top in KEPT_AWAY:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+KEPT_AWAY = set(sys.argv[1:])
+sys.meta_path.insert(0, Missing())
+import rcdsac_trl
+policy = rcdsac_trl.load("rcdsac_pow-narrow")
+for step in range(20):
+    command = policy.act([2.5] * 180, [[2.0, 0.0], [4.0, 1.0]], [0.3, 0.0], beta=-1.0)
+assert command.reason is None and command.v_m_per_s > 0.0, command
+print(rcdsac_trl.__version__, rcdsac_trl.__file__)
+"""
+
+
+def metadata(installed: Path) -> Message:
+    (path,) = installed.glob("*.dist-info/METADATA")
+    return message_from_string(path.read_text())
+
+
+def modules_of_dependencies(installed: Path) -> list[str]:
+    """Name the modules of every package that the wheel asks for, but those that driving needs."""
+    lines = metadata(installed).get_all("Requires-Dist") or []
+    asked = {re.split(r"[^\w-]", line)[0].lower() for line in lines if "extra ==" not in line}
+    names = packages_distributions()
+    owned = {name for name, owners in names.items() if asked.intersection(owner.lower() for owner in owners)}
+    return sorted(owned - {*BARE})
+
+
+def test_the_wheel_drives_with_numpy_and_safetensors_alone(installed: Path, tmp_path: Path) -> None:
+    kept_away = modules_of_dependencies(installed)
+    assert {"torch", "torchrl", "hydra", "pybullet", "gymnasium", "pandas", "numba", "yaml"} <= set(kept_away)
+    driven = python(installed, tmp_path, "-c", DRIVE, *kept_away)
+    assert driven.returncode == 0, driven.stderr
+    version, file = driven.stdout.split()
+    assert version == rcdsac_trl.__version__
+    assert Path(file) == installed / "rcdsac_trl" / "__init__.py"
+    assert metadata(installed)["Version"] == version
+    (scripts,) = installed.glob("*.dist-info/entry_points.txt")
+    assert scripts.read_text().splitlines()[1].startswith("rcdsac-trl = ")
+
+
+@pytest.mark.slow
+def test_the_wheel_in_an_environment_of_its_own_drives(installed: Path, tmp_path: Path) -> None:
+    """With nothing but what driving needs, as an installer puts it there; takes it from a package index."""
+    (wheel,) = installed.parent.glob("*.whl")
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "bare")], check=True)
+    bare = str(tmp_path / "bare" / "bin" / "python")
+    pip = [bare, "-m", "pip", "install", "--quiet", "-c", str(ROOT / "constraints.txt")]
+    subprocess.run([*pip, *BARE], check=True)
+    subprocess.run([*pip, "--no-deps", str(wheel)], check=True)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    driven = subprocess.run(
+        [bare, "-c", DRIVE],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert driven.returncode == 0, driven.stderr
+    assert str(tmp_path / "bare") in driven.stdout
 
 
 def test_the_wheel_trains_outside_the_checkout(installed: Path, tmp_path: Path) -> None:

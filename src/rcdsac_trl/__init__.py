@@ -30,10 +30,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rcdsac_trl.world.task import gymnasium_id
+from rcdsac_trl.config import gymnasium_id
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy import Policy
+    from rcdsac_trl.world.task.world_settings import WorldSettings
+
+__version__ = "0.1.0"
 
 
 def load(name_or_folder: str | Path, **options: Any) -> "Policy":
@@ -48,6 +51,7 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
     Raises:
         rcdsac_trl.errors.UserInputError: if there is no such agent, or it cannot be read.
     """
+    _register_beside_gymnasium()
     # Imported late, so that importing the package stays instant.
     from rcdsac_trl.deploy import Policy, find_weights, read_weights
 
@@ -58,19 +62,46 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
     return Policy(read_weights(find_weights(name_or_folder)), **options)
 
 
+def world_settings(**options: Any) -> "WorldSettings":
+    """Return what an environment is made of, by the names of ``conf/``.
+
+    Args:
+        options: `map` (a name of ``conf/map``, or a file that maps are read from),
+            `robot` (a name of ``conf/robot``) and fields of
+            :class:`~rcdsac_trl.world.task.world_settings.WorldSettings`.
+
+    Raises:
+        rcdsac_trl.errors.UserInputError: for a name that does not exist, and values that do not fit together.
+
+    Example:
+        >>> world_settings(map="easy", sensor="sparse", num_agents=2).map_settings.num_movers
+        0
+    """
+    _register_beside_gymnasium()
+    from rcdsac_trl.config.named_world import named_world
+
+    return named_world(**options)
+
+
 def register_gym() -> None:
     """Register ``RCDSACNavigation-v0`` with Gymnasium, for ``gymnasium.make``; harmless when done before.
 
-    Needed only where this package is imported before Gymnasium: else importing it registers the name.
+    Needed only where this package is imported before Gymnasium: else importing it registers the name, as do
+    :func:`load` and :func:`world_settings`.
 
     Example:
         >>> import gymnasium
         >>> register_gym()
-        >>> env = gymnasium.make("RCDSACNavigation-v0", sensor="sparse")
+        >>> env = gymnasium.make("RCDSACNavigation-v0", map="hard", robot="turtlebot4", sensor="sparse")
     """
     gymnasium_id.register()
 
 
+def _register_beside_gymnasium() -> None:
+    """Register the name where Gymnasium is there already: importing it takes longer than all else here."""
+    if "gymnasium" in sys.modules:
+        register_gym()
+
+
 # gymnasium.make("rcdsac_trl:RCDSACNavigation-v0") imports this module first, and then looks for the name.
-if "gymnasium" in sys.modules:
-    register_gym()
+_register_beside_gymnasium()

@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from rcdsac_trl.config.command_line import expanded, key_of
 from rcdsac_trl.config.compose import combinations, compose, output_folder, with_sections
 from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.config.verb_help import verb_help
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.system.interrupts import ended_by, endings_as_interrupts
 from rcdsac_trl.system.progress import never_silent
@@ -83,6 +84,8 @@ class OverridesCommand:
         _program(self._start)
 
     def _start(self) -> None:
+        if shows_help(self.name, sys.argv[1:]):
+            return
         arguments = read_arguments(sys.argv[1:])
         if arguments is None:
             _hydra_main(self.name, lambda cfg: None)
@@ -114,6 +117,8 @@ def entry_point(
 
     def decorate(task: Task) -> Callable[[], None]:
         def start() -> None:
+            if shows_help(config_name, sys.argv[1:]):
+                return
             arguments = read_arguments(sys.argv[1:])
             if instead is not None and arguments is not None and instead(arguments.overrides, arguments.multirun):
                 return
@@ -123,6 +128,14 @@ def entry_point(
         return partial(_program, start)
 
     return decorate
+
+
+def shows_help(verb: str, argv: list[str]) -> bool:
+    """Explain a verb if its arguments ask for that, and say whether they did."""
+    args, _ = _parsed(argv)
+    if args.help:
+        print(verb_help(verb, args.overrides))
+    return bool(args.help)
 
 
 def _hydra_main(config_name: str, task: Task) -> None:

@@ -1,5 +1,6 @@
 """Train an agent: ``python -m rcdsac_trl.train +algo=rcdsac_pow``; go on: ``.. resume=runs/<folder>``; many: ``-m``."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
@@ -28,6 +29,7 @@ def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
     trainer = resume_training(folder)
     if trainer is None:
         print(f"{folder} is finished: nothing is left to do")
+        _lead_on(folder)
     else:
         _run(trainer)
     return True
@@ -52,6 +54,17 @@ def _run(trainer: "Trainer") -> None:
 
     with at_safe_points():
         trainer.run()
+    if trainer.is_finished:
+        _lead_on(trainer.log.folder)
+
+
+def _lead_on(folder: Path) -> None:
+    """Say what to do with a finished run, in lines to be copied."""
+    from rcdsac_trl.config.command_line import assigned
+    from rcdsac_trl.system.invocation import from_here, program
+
+    run = assigned("run", from_here(folder))
+    print(f"next: {program()} evaluate {run}\n      {program()} plot_training {run}")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from omegaconf import DictConfig
 
@@ -24,6 +25,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.measured_run import MeasuredRun
 from rcdsac_trl.report.card import driving_section
 from rcdsac_trl.storage.checkpoint_record import load_progress
+from rcdsac_trl.system.invocation import program
 from tiny import ROWS, TINY
 
 POW = "+algo=rcdsac_pow"
@@ -267,8 +269,7 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         ([RUN, "baseline=pursuit"], f"{EITHER} or baseline=<name>, such as mppi"),
         (["run=nowhere"], "there is no agent 'nowhere': shipped are "),
         (["run=123"], "run=123 must be text or null"),
-        ([RUN], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
-        ([RUN, "beta=[]"], "rcdsac_pow drives as its beta says: give one, such as beta=[-2,-1.5,-1,-0.5]"),
+        ([RUN, "beta=[]"], "beta=[] names none: leave it out for beta=[-2,-1.5,-1,-0.5], or give one"),
         ([RUN, "beta=[-1,-3]"], "beta = -3 is outside the domain [-2, 0] of measure 'pow'"),
         ([RUN, "beta=-1"], "beta=-1 must be a list of numbers in brackets or null"),
         ([RUN, "beta=[low]"], "beta=['low'] must be a list of numbers in brackets or null"),
@@ -320,6 +321,10 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
         (["baseline=random"], "baseline=random is unknown: choose one of pursuit, dwa, mppi, or <module>:<class>"),
         (["baseline=3"], "baseline=3 must be text or null"),
+        (
+            ["baseline=pursuit", "beta_controller=[clearance]"],
+            "baseline=pursuit has no beta to turn: leave",
+        ),
         (["baseline=pursuit", "beta=[-1]"], "baseline=pursuit has neither beta nor collision weight: leave them out"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -443,9 +448,13 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     assert "Traceback" not in err
-    assert "collisions_mean" in out
-    assert out.endswith("written to there\n")
+    heading, _, averse, bolder, hit, written, following = out.splitlines()
+    assert heading.startswith("rcdsac_pow, evaluation maps 1 × 2 episodes of 20 steps")
+    assert (averse.split()[0], bolder.split()[0], written) == ("beta=-2", "beta=-1", "written to there")
+    assert hit.startswith(("hit: ", "nothing was hit"))
+    assert following == f"next: {program()} report runs=[there]"
     assert [path.name for path in cwd.iterdir()] == ["there"]
+    assert {"collisions_mean", "collisions_std"} <= set(pd.read_csv(cwd / "there" / "summary.csv"))  # all numbers
     for name in ("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json"):
         assert (cwd / "there" / name).read_bytes() == (here / name).read_bytes()
 

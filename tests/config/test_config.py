@@ -437,8 +437,9 @@ def test_a_betas_domain_is_checked_wherever_a_beta_is_given() -> None:
 
 def test_conditions_of_an_evaluation() -> None:
     assert algo().conditions([-2, 0], None) == [Condition(beta=-2.0), Condition(beta=0.0)]
-    with pytest.raises(UserInputError, match=r"drives as its beta says: give one, such as beta=\[-2,-1\]"):
-        algo().conditions(None, None)
+    assert algo().conditions(None, None) == [Condition(beta=-2.0), Condition(beta=-1.0)]  # the row's own
+    with pytest.raises(UserInputError, match=r"^beta=\[\] names none: leave it out for beta=\[-2,-1\], or give one$"):
+        algo().conditions([], None)
     with pytest.raises(UserInputError, match="more than once"):
         algo().conditions([-1, -1.0], None)
     with pytest.raises(UserInputError, match="has no collision weight"):

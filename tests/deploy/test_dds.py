@@ -453,7 +453,7 @@ def test_the_program_tells_who_reads_it_whenever_that_changes(capsys: pytest.Cap
     assert bridge.steps == -1
     assert capsys.readouterr().err.splitlines() == [
         "topics: /scan; Ctrl-C ends it",
-        "there is no scan yet; it drives on with the next good input",
+        "there is no scan yet; it stands until good input comes",
         "nobody reads /cmd_vel",
         "/cmd_vel is read as geometry_msgs/msg/Twist",
     ]

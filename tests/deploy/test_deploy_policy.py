@@ -273,7 +273,7 @@ def test_bad_input_stops_the_robot(change: dict[str, Any], reason: str) -> None:
     assert command.quantiles is None
     with pytest.raises(AssertionError, match=reason):
         raise AssertionError(command.reason)
-    assert command.reason.endswith("; it drives on with the next good input")
+    assert command.reason.endswith("; it stands until good input comes")
     assert not policy.act(**GOOD).stopped
 
 

@@ -1,7 +1,8 @@
 """The ROS node on a stand-in for rclpy: what it reads, writes and tells. ROS itself cannot be installed here."""
 
-import importlib
+import importlib.util
 import math
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from test_robot_driver import cloud, laser, odometry, path
 
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
 from rcdsac_trl.deploy.policy.weights import packed
+from rcdsac_trl.errors import UserInputError
 from robots import agent
 
 
@@ -241,4 +243,19 @@ def test_the_program_spins_and_leaves_ros(ros_node: Any, monkeypatch: pytest.Mon
     monkeypatch.setattr(Node, "destroy_node", lambda node: done.append(node.told[-1]))
     monkeypatch.setattr(ros_node.rclpy, "try_shutdown", lambda: done.append("left"))
     ros_node.main()
-    assert done == ["there is no odometry yet; it drives on with the next good input", "left"]
+    assert done == ["there is no odometry yet; it stands until good input comes", "left"]
+
+
+def test_without_ros_it_says_what_to_source(tmp_path: Path) -> None:
+    if importlib.util.find_spec("rclpy") is not None:
+        pytest.skip("there is ROS here")
+    name = "rcdsac_trl.deploy.ros_node"
+    done = subprocess.run([sys.executable, "-m", name], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(
+        f"rcdsac_trl: this Python ({sys.version_info[0]}.{sys.version_info[1]}) has no rclpy ("
+    )
+    assert "source /opt/ros/<distribution>/setup.bash" in done.stderr
+    assert done.stderr.endswith("python -m rcdsac_trl.deploy.dds_node <agent>\n")
+    with pytest.raises(UserInputError, match="has no rclpy"):
+        importlib.import_module(name)

@@ -1,5 +1,6 @@
 """Calibration: critics whose quantiles are known, and roll-outs that really start from one state."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from omegaconf import OmegaConf
 import tiny
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.config.evaluation_settings import CalibrationSettings
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import fractions, predict, roll_out
 from rcdsac_trl.evaluation.calibration import make_calibration
@@ -221,9 +224,18 @@ def test_an_exported_agent_brings_what_a_calibration_needs(tiny_run: Path, tmp_p
     assert len(pd.read_csv(calibration.results.path / "predictions.csv")) == 2
 
 
+def test_a_horizon_fits_the_task_and_betas_the_row(tiny_run: Path) -> None:
+    calibration = make_calibration(compose("calibrate", [f"run={tiny_run}", "num_workers=0"]))
+    described = json.loads(calibration.results.described)
+    assert described["horizon_steps"] == tiny.STEPS // 2
+    assert described["conditions"] == ["beta=-2", "beta=-1.5", "beta=-1", "beta=-0.5"]
+    settings = read_config(compose("calibrate", []), CalibrationSettings)
+    assert [settings.horizon_in(steps) for steps in (1000, 21, 2)] == [500, 10, 1]
+    with pytest.raises(UserInputError, match=r"^horizon_steps=1 must be below the 1 steps of an episode"):
+        settings.horizon_in(1)
+
+
 def test_what_cannot_be_calibrated_is_refused(tiny_run: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserInputError, match="drives as its beta says"):
-        calibrate(tiny_run)
     with pytest.raises(UserInputError, match=r"horizon_steps=20 must be below the 20 steps"):
         calibrate(tiny_run, "beta=[-1]", "horizon_steps=20")
     # Of 3 states and in one process; a simulation takes 28 MB.

@@ -97,7 +97,7 @@ def test_the_way_that_was_driven_gives_the_waypoints_where_there_is_no_plan(tmp_
         assert row["waypoint_ahead_m"] == pytest.approx(4.0 - row["x_m"], abs=0.051)
         assert row["measured_v_m_per_s"] == pytest.approx(0.4, abs=1e-3)
         assert set(table.loc[table["stopped"] == 1, "cause"]) == {
-            "the goal is reached; it drives on with the next good input"
+            "the goal is reached; it stands until good input comes"
         }
         # Within 15 cm of 4 m, where odometry had its last point.
         assert table.loc[table["stopped"] == 1, "time_s"].iloc[0] == pytest.approx((4.0 - 0.15) / 0.4, abs=0.2)

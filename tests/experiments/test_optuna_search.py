@@ -12,6 +12,7 @@ from rcdsac_trl.experiments import optuna_search as search
 from rcdsac_trl.experiments.optuna_search import Search, make_search
 from rcdsac_trl.experiments.search_space import Choice, Number
 from rcdsac_trl.experiments.sweep import Job, State
+from rcdsac_trl.system.invocation import program
 from tiny import SMALL, Calls
 
 pytest.importorskip("optuna")
@@ -83,7 +84,7 @@ def test_a_trial_is_worth_the_mean_of_its_last_validations(trained: Callable, ca
     assert out[0] == f"1/3 finished 235.0 trial-0000: learner.gamma={gammas[0]}"
     assert out[2] == f"3/3 failed trial-0002: learner.gamma={gammas[2]} (exit code 1: nan)"
     assert out[-2] == "best 235.0 multirun/search-mine/trial-0000"
-    assert out[-1] == f"python -m rcdsac_trl.train +algo=sac learner.gamma={gammas[0]}"
+    assert out[-1] == f"{program()} train +algo=sac learner.gamma={gammas[0]}"
     assert len(pd.read_csv("multirun/search-mine/trials.csv")) == 3
 
 

@@ -13,6 +13,7 @@ import pytest
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import __main__ as command
 from rcdsac_trl.report import collision_report, findings, statistics, table
+from rcdsac_trl.report.evaluation_summary import summarised
 from rcdsac_trl.report.figures import collision_causes, learning_curves
 from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.read import read_episodes
@@ -353,17 +354,49 @@ def test_controllers_collide_under_their_names(tmp_path: Path) -> None:
 
 def test_an_evaluation_is_told_what_was_hit(tmp_path: Path) -> None:
     folder = with_collisions(evaluate(tmp_path / "a", "rcdsac_pow", {-2.0: 0, -1.0: 1}), [(-1.0, "mover", 0, 0.2)])
-    text = collision_report.write_collisions(folder)
+    written = collision_report.write_collisions(folder)
     summary = pd.read_csv(folder / "collision_summary.csv")
     assert summary[["beta", "thing", "collisions"]].to_numpy().tolist() == [
         [-2, "all", 0],
         [-1, "all", 1],
         [-1, "mover", 1],
     ]
-    assert len(text.splitlines()) == 1 + len(summary)
+    assert written["thing"].tolist() == summary["thing"].tolist()
     (folder / "collisions.csv").write_text("beta,collision_weight,map,episode,thing\n")
     with pytest.raises(UserInputError, match="does not say bearing_rad, bearing_sensed, unsensed_s"):
         read_episodes([folder])
+
+
+def test_an_evaluation_in_a_few_lines(tmp_path: Path) -> None:
+    """Its collisions are 0, 1, 2 of three episodes, plus 0 or 1: deviation sqrt(2/3) = 0.82."""
+    folder = evaluate(tmp_path / "a", "rcdsac_pow", {-2.0: 0, -1.5: 1})
+    episodes = pd.read_csv(folder / "episodes.csv").assign(contact_fraction=[0.0, 0.03, 0.03] * 2 * MAPS)
+    episodes.to_csv(folder / "episodes.csv", index=False)
+    with_collisions(folder, [(-2.0, "mover", 0, 0.2)] * 3 + [(-1.5, "outer_wall", 1, 0.2)])
+    heading, columns, *rows, hit = summarised(folder).splitlines()
+    assert heading == "rcdsac_pow, evaluation maps 6 × 3 episodes of 1000 steps, mean ± standard deviation:"
+    assert " ".join(columns.split()) == "collisions reward goals speed, m/s in contact without collision"
+    # Rewards: 100 map + 10 episode - 5 more; of 0 to 5 and of 0 to 2: 250 + 10, deviation sqrt(100² 35/12 + 10² 2/3).
+    averse = "beta=-2 1.00 ± 0.82 260 ± 171 2.00 ± 0.00 0.40 ± 0.00 2.0% ± 1.4% 33%"
+    bolder = "beta=-1.5 2.00 ± 0.82 255 ± 171 2.00 ± 0.00 0.41 ± 0.00 2.0% ± 1.4% 0%"
+    assert [" ".join(row.split()) for row in rows] == [averse, bolder]
+    assert hit == "hit: mover 75%, outer wall 25%"
+    assert len(pd.read_csv(folder / "collision_summary.csv")) == 4
+
+
+def test_a_few_lines_name_controllers_weights_and_who_is_told_nothing(tmp_path: Path) -> None:
+    def named(folder: Path) -> list[str]:
+        episodes = pd.read_csv(folder / "episodes.csv").assign(contact_fraction=0.0)
+        episodes.to_csv(folder / "episodes.csv", index=False)
+        with_collisions(folder, [])
+        *_, hit = lines = summarised(folder).splitlines()
+        assert hit == "nothing was hit"
+        return [line.split("  ")[0] for line in lines[2:-1]]
+
+    turned = with_controllers(tmp_path / "a", "rcdsac_pow", {-2.0: 2}, {"clearance": 0})
+    assert named(turned) == ["beta=-2", "clearance"]
+    assert named(evaluate(tmp_path / "b", "rcwr", {1.5: 0}, column="collision_weight")) == ["w_coll=1.5"]
+    assert named(evaluate(tmp_path / "c", "pursuit", {NONE: 0})) == ["pursuit"]
 
 
 def test_things_are_those_of_the_world() -> None:

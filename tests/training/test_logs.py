@@ -1,10 +1,14 @@
 """The run folder: what a run was made of, and all that it says while it trains."""
 
+import importlib.util
 import json
+import os
 import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -156,3 +160,76 @@ def test_tables_grow_under_one_header(tmp_path: Path) -> None:
     log.close()
     assert (tmp_path / "training_episodes.csv").read_text() == ("iteration,reward\n0,0.333333\n0,2\n1,0.333333\n1,2\n")
     assert (tmp_path / "train.log").read_text() == "hello\n"
+
+
+# ------------------------------------------------------------------------------------------------ other records
+def test_mlflow_writes_into_the_run_folder_or_to_the_users_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a stand-in: MLflow is large. It refuses folders of files, so it is given a database."""
+    called: list[tuple[str, Any]] = []
+    stand_in = ModuleType("mlflow")
+    stand_in.__dict__.update(
+        set_tracking_uri=lambda uri: called.append(("uri", uri)),
+        get_experiment_by_name=lambda name: None,
+        create_experiment=lambda **given: called.append(("experiment", given)) or "7",
+        start_run=lambda **given: called.append(("run", given)),
+        set_experiment=lambda experiment_id: None,
+        log_metric=lambda **given: called.append(("metric", given)),
+    )
+    monkeypatch.setitem(sys.modules, "mlflow", stand_in)
+    monkeypatch.setattr("torchrl.record.loggers.mlflow._has_mlflow", True)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    folder = tmp_path / "my-run"
+    folder.mkdir()
+    log = RunLog(folder, ["mlflow"])
+    log.scalars({"train/reward": 1.5}, 40)
+    log.close()
+    told = dict(called)
+    assert told["uri"] == f"sqlite:///{folder}/mlflow.db"
+    assert told["experiment"]["name"] == "my-run"
+    assert told["experiment"]["artifact_location"] == (folder / "mlartifacts").as_uri()
+    assert told["run"] == {"experiment_id": "7"}
+    assert told["metric"] == {"key": "train/reward", "value": 1.5, "step": 40}
+
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://server:5000")
+    RunLog(folder, ["mlflow"]).close()
+    assert dict(called)["uri"] == "http://server:5000"
+    assert dict(called)["experiment"]["artifact_location"] is None  # the server's own
+
+
+def test_wandb_writes_into_the_run_folder_under_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a stand-in; without a network, the user's WANDB_MODE=offline is left to decide."""
+    called: dict[str, Any] = {}
+    experiment = SimpleNamespace(
+        config=SimpleNamespace(update=lambda *_, **__: None),
+        log=lambda values, **_: called.update(values),
+        define_metric=lambda *_, **__: None,
+    )
+    stand_in = ModuleType("wandb")
+    stand_in.__dict__["init"] = lambda **given: called.update(given) or experiment
+    monkeypatch.setitem(sys.modules, "wandb", stand_in)
+    monkeypatch.setattr("torchrl.record.loggers.wandb._has_wandb", True)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    folder = tmp_path / "my-run"
+    folder.mkdir()
+    log = RunLog(folder, ["wandb"])
+    log.scalars({"train/reward": 1.5}, 40)
+    log.close()
+    assert (called["name"], called["dir"]) == ("my-run", str(folder))
+    assert called["train/reward"] == 1.5
+    assert os.environ["WANDB_MODE"] == "offline"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("wandb") is None, reason="wandb is not installed")
+def test_wandb_offline_leaves_a_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    folder = tmp_path / "my-run"
+    folder.mkdir()
+    log = RunLog(folder, ["wandb"])
+    log.scalars({"train/reward": 1.5}, 40)
+    log.close()
+    importlib.import_module("wandb").finish()
+    (record,) = folder.glob("wandb/offline-run-*/*.wandb")
+    assert record.stat().st_size > 0

@@ -24,6 +24,7 @@ from torchrl.checkpoint import Checkpoint
 from rcdsac_trl import train
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import Progress, folders, newest
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.run_folder import cut, lengths
 from rcdsac_trl.training.setup import resume_training
 from tiny import TINY, tiny_trainer
@@ -414,7 +415,10 @@ def unfinished(run: Path) -> Path:
 def test_a_finished_run_says_so_and_changes_nothing(command: Any, short: Path, capsys: Any) -> None:
     before = files_of(short)
     command([f"resume={short}"])
-    assert capsys.readouterr().out == f"{short} is finished: nothing is left to do\n"
+    told, evaluating, plotting = capsys.readouterr().out.splitlines()
+    assert told == f"{short} is finished: nothing is left to do"
+    assert evaluating == f"next: {program()} evaluate run={short}"
+    assert plotting.strip() == f"{program()} plot_training run={short}"
     assert files_of(short) == before
 
 
@@ -493,7 +497,9 @@ def test_auto_finds_the_newest_unfinished_run_of_this_config_else_begins_one(
     begun: list[Path] = []
     monkeypatch.setattr(
         "rcdsac_trl.training.setup.make_trainer",
-        lambda cfg, folder, overrides: SimpleNamespace(run=lambda: begun.append(Path(folder).relative_to(tmp_path))),
+        lambda cfg, folder, overrides: SimpleNamespace(
+            run=lambda: begun.append(Path(folder).relative_to(tmp_path)), is_finished=False
+        ),
     )
     command([*START, "resume=auto", "hydra.run.dir=runs/new"])
     assert "resume=auto: no unfinished run of this config in runs, so a new one\n" in capsys.readouterr().out
@@ -506,6 +512,6 @@ def test_auto_with_a_named_folder_means_that_one(
     command([*START, "resume=auto", f"hydra.run.dir={unfinished(copied)}"])
     assert_equal_runs(copied, short)
     command([*START, "resume=auto", f"hydra.run.dir={copied}"])
-    assert capfd.readouterr().out.endswith(f"{copied} is finished: nothing is left to do\n")
+    assert f"{copied} is finished: nothing is left to do\n" in capfd.readouterr().out
     told = refusal([*START, "seed=7", "resume=auto", f"hydra.run.dir={copied}"])
     assert told == f"{copied} holds a run of another config: choose another hydra.run.dir"

@@ -13,12 +13,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 import rcdsac_trl
+from rcdsac_trl.config.gymnasium_id import ENV_ID
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.task.env import NavigationEnv
 from rcdsac_trl.world.task.gymnasium_env import NavigationGymEnv
-from rcdsac_trl.world.task.gymnasium_id import ENV_ID
 from rcdsac_trl.world.task.rules import TaskSettings
 
 SMALL = MapSettings(size_m=12.0, layouts=("clutter",), clutter_per_m2=0.08, num_movers=1)
@@ -57,7 +57,7 @@ def test_the_id_is_registered_on_request_and_not_before() -> None:
         "rcdsac_trl.register_gym()\n"
         "rcdsac_trl.register_gym()\n"
         "import gymnasium\n"
-        f"assert gymnasium.spec({ENV_ID!r}).entry_point == 'rcdsac_trl.world.task.gymnasium_env:NavigationGymEnv'\n"
+        f"assert gymnasium.spec({ENV_ID!r}).entry_point == 'rcdsac_trl.config.named_world:gymnasium_env'\n"
     )
     run(code)
     rcdsac_trl.register_gym()
@@ -68,6 +68,7 @@ def test_the_id_is_registered_on_request_and_not_before() -> None:
     [
         f"gymnasium.make('rcdsac_trl:{ENV_ID}')",
         f"gymnasium.make('rcdsac_trl.world.task.gymnasium_env:{ENV_ID}')",
+        f"(importlib.import_module('rcdsac_trl').world_settings(), gymnasium.make('{ENV_ID}'))[1]",
         f"(importlib.import_module('rcdsac_trl'), gymnasium.make('{ENV_ID}'))[1]",
     ],
 )

@@ -124,17 +124,17 @@ class AlgoSettings:
         return [Condition(beta=self.beta)]
 
     def conditions(self, betas: Sequence[float] | None, weights: Sequence[float] | None) -> list[Condition]:
-        """Turn what a user asks of an evaluation into conditions.
+        """Turn what a user asks of an evaluation into conditions; of a user who asks for none, those of the row.
 
         Raises:
-            UserInputError: if a beta is missing, or a beta or a weight is superfluous or outside its domain.
+            UserInputError: if a beta or a weight is superfluous or outside its domain, or none is left.
         """
         if weights is not None and self.collision_weight is None:
             raise UserInputError(f"{self.name} has no collision weight: leave collision_weight out")
-        if self.conditioning == "per_episode":
+        if self.conditioning == "per_episode" and betas is not None:
             if not betas:
                 shown = ",".join(f"{beta:g}" for beta in self.distortion.evaluation_betas)
-                raise UserInputError(f"{self.name} drives as its beta says: give one, such as beta=[{shown}]")
+                raise UserInputError(f"beta=[] names none: leave it out for beta=[{shown}], or give one")
             for beta in betas:
                 self.distortion.measure.check(beta)
             asked = [Condition(beta=float(beta)) for beta in betas]

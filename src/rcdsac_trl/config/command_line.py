@@ -9,6 +9,8 @@ from rcdsac_trl.errors import UserInputError
 
 # Where a path may begin in a value is behind the key, in a list, behind a quote; a variable may be any part of it.
 _HOME = re.compile(r"""(?<=[=\[,'"])~(?P<user>[\w.-]*)(?=[/,\]'"]|$)""")
+# What neither a shell nor Hydra reads as its own.
+_PLAIN = r"[\w/.+-]+"
 _VARIABLE = re.compile(r"""(?<=[=\[,'"/])\$(?P<name>[A-Za-z_]\w*)""")
 
 
@@ -65,6 +67,29 @@ def quoted(key: str, value: str) -> str:
     """
     escaped = value.strip("'\"").replace('"', '\\"')
     return shlex.quote(f'{key}="{escaped}"')
+
+
+def assigned(key: str, value: str) -> str:
+    """Write an override so that a shell and Hydra leave its value as it is, plainly where that will do.
+
+    Example:
+        >>> print(assigned("run", "runs/a"), assigned("run", "my runs/a"))
+        run=runs/a 'run="my runs/a"'
+    """
+    return f"{key}={value}" if re.fullmatch(_PLAIN, value) else quoted(key, value)
+
+
+def listed(key: str, value: str) -> str:
+    """Write an override whose value is a list of one text, as :func:`assigned` does.
+
+    Example:
+        >>> print(listed("runs", "runs/a"), listed("runs", "my runs/a"))
+        runs=[runs/a] 'runs=["my runs/a"]'
+    """
+    if re.fullmatch(_PLAIN, value):
+        return f"{key}=[{value}]"
+    escaped = value.replace('"', '\\"')
+    return shlex.quote(f'{key}=["{escaped}"]')
 
 
 def unreadable(override: str, overrides: list[str]) -> str:

@@ -2,7 +2,8 @@
 
 import os
 import re
-from contextlib import nullcontext
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -100,33 +101,52 @@ def _compose(config_name: str, overrides: list[str], *, return_hydra_config: boo
         if not key_of(override).partition("@")[0].strip():  # Hydra fails an assertion
             raise UserInputError(f"{override} names no key: write it as <key>=<value>, without spaces around =")
     overrides = with_sections(config_name, overrides)
-    # Inside a Hydra main the search path is set up already, and setting it up twice is an error.
-    inside = GlobalHydra.instance().is_initialized()
-    with nullcontext() if inside else hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3"):
+    with _initialized():
         try:
             return hydra.compose(config_name, overrides=overrides, return_hydra_config=return_hydra_config)
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise UserInputError(_sentence(error, config_name, overrides)) from error
 
 
+def _initialized() -> AbstractContextManager[None]:
+    """Let Hydra know conf/; inside a Hydra main it does already, and being told twice is an error."""
+    if GlobalHydra.instance().is_initialized():
+        return nullcontext()
+    return hydra.initialize_config_dir(str(CONF_DIR), version_base="1.3")
+
+
 def with_sections(config_name: str, overrides: list[str]) -> list[str]:
-    """Let a key of a section that is null until it is chosen change that section, where the root takes a part of one.
+    """Complete overrides by what they imply.
+
+    A key of a section that is null until it is chosen changes that section, where the root takes a part of one.
 
     `evaluate` completes ``task.episode_steps=200`` with the task that the agent was trained for; Hydra alone would want
-    a plus before it.
+    a plus before it. `train` takes row, sensor, robot and networks of the agent that ``init`` names.
 
     Example:
         >>> with_sections("evaluate", ["run=a", "task.episode_steps=200"])
         ['run=a', '+task.episode_steps=200']
     """
+    if config_name == "train":
+        return _with_init(overrides)
     if config_name != "evaluate":
         return overrides
     chosen = {key_of(override) for override in overrides}
-    absent = {group for group, option in _root_groups(config_name).items() if option is None} - chosen
+    absent = {group for group, option in root_groups(config_name).items() if option is None} - chosen
     return [f"+{o}" if o.partition(".")[0] in absent else o for o in overrides]
 
 
-def _root_groups(config_name: str) -> dict[str, str | None]:
+def _with_init(overrides: list[str]) -> list[str]:
+    """Let a training that begins with an agent be of that agent's kind."""
+    named = [override.partition("=")[2].strip("'\"") for override in overrides if key_of(override) == "init"]
+    if not named or named[-1] in ("", "null") or "," in named[-1]:
+        return overrides
+    from rcdsac_trl.config.init_overrides import with_the_agents_own  # late: it reads what it names through this module
+
+    return with_the_agents_own(named[-1], overrides)
+
+
+def root_groups(config_name: str) -> dict[str, str | None]:
     """Return the groups in which a root takes a choice, and the option it takes if none is named."""
     root: Any = OmegaConf.to_container(OmegaConf.load(CONF_DIR / f"{config_name}.yaml"))
     entries = [entry for entry in root["defaults"] if isinstance(entry, dict)]
@@ -164,9 +184,9 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
 
 def _no_key(key: str, config_name: str, overrides: list[str]) -> str:
     """Say what to write in place of a key that a composed config does not have."""
-    known = _all_keys(config_name, overrides)
+    known = all_keys(config_name, overrides)
     group, _, below = key.partition(".")
-    groups = _root_groups(config_name)
+    groups = root_groups(config_name)
     if below and group in groups:
         plus = "+" if group == "algo" else ""
         if groups[group] is None and group not in known:
@@ -181,12 +201,14 @@ def _option_has(group: str, option: str, key: str) -> bool:
     return OmegaConf.select(OmegaConf.load(CONF_DIR / group / f"{option}.yaml"), key, default=_ABSENT) is not _ABSENT
 
 
-def _all_keys(config_name: str, overrides: list[str]) -> list[str]:
+def all_keys(config_name: str, overrides: Sequence[str] = ()) -> list[str]:
+    """List the keys of a composed config and its sections, with the choices among the overrides where they compose."""
     groups = [o for o in overrides if "." not in o.split("=")[0]]
-    try:
-        cfg = hydra.compose(config_name, overrides=groups)
-    except (HydraException, OmegaConfBaseException):
-        cfg = hydra.compose(config_name)
+    with _initialized():
+        try:
+            cfg = hydra.compose(config_name, overrides=groups)
+        except (HydraException, OmegaConfBaseException):
+            cfg = hydra.compose(config_name)
     return _keys_of(OmegaConf.to_container(cfg), "")
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
 from rcdsac_trl.config.typed import read, section_class
@@ -141,10 +142,8 @@ class EvaluationSettings:
         if self.baseline is not None and (self.navigation.replan or self.navigation.watchdog):
             raise UserInputError(f"baseline={self.baseline} navigates by itself: leave navigation out")
         asked = self.beta_controller or ()
-        if asked and len(self.beta or ()) < 2:
-            raise UserInputError(
-                f"beta_controller=[{','.join(asked)}] turns beta between the values of beta: give two or more of them"
-            )
+        if asked and self.baseline is not None:
+            raise UserInputError(f"baseline={self.baseline} has no beta to turn: leave beta_controller out")
         for name in asked:
             if asked.count(name) > 1:
                 raise UserInputError(f"beta_controller={name} is given more than once: name every one once")
@@ -159,6 +158,22 @@ class EvaluationSettings:
         resolve_processes(self.num_workers, self.num_maps)
         runtime.check_device_name(self.device)
         runtime.resolve_threads(self.threads)
+
+    def conditions_of(self, trained: TrainingSettings) -> list[Condition]:
+        """Return what the episodes of a map are driven under: every value of beta or weight, then every controller.
+
+        Raises:
+            UserInputError: for values that the agent does not take, and controllers with nothing to turn beta between.
+        """
+        if self.run is None:
+            return [Condition()]
+        fixed = trained.algo.conditions(self.beta, self.collision_weight)
+        asked = self.beta_controller or ()
+        if asked and sum(condition.beta is not None for condition in fixed) < 2:
+            raise UserInputError(
+                f"beta_controller=[{','.join(asked)}] turns beta between the values of beta: give two or more of them"
+            )
+        return [*fixed, *(Condition(controller=name) for name in asked)]
 
     def world_of(self, trained: TrainingSettings) -> ChosenWorld:
         """Return map set, sensor, task and robot: those of a training, with what was chosen in their place.
@@ -235,7 +250,7 @@ class CalibrationSettings:
     num_maps: int
     num_states: int
     num_rollouts: int
-    horizon_steps: int
+    horizon_steps: int | None
     cross_evaluate: bool
     out: str | None
     num_workers: Workers
@@ -252,6 +267,20 @@ class CalibrationSettings:
             )
         resolve_processes(self.num_workers, self.num_maps)
         runtime.resolve_threads(self.threads)
+
+    def horizon_in(self, episode_steps: int) -> int:
+        """Return the steps of a roll-out in episodes of some length: half of one, unless a user says otherwise.
+
+        Raises:
+            UserInputError: if that leaves no step of an episode for states.
+        """
+        horizon = max(1, episode_steps // 2) if self.horizon_steps is None else self.horizon_steps
+        if not 0 < horizon < episode_steps:
+            raise UserInputError(
+                f"horizon_steps={horizon} must be below the {episode_steps} steps of an episode, so that states can be "
+                "met in it: shorten it, or leave it out for half of an episode"
+            )
+        return horizon
 
 
 @dataclass(frozen=True)

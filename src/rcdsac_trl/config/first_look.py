@@ -34,8 +34,7 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     """
     settings = read_config(cfg, EvaluationSettings)
     trained = default_training() if settings.run is None else find_agent(settings.run).settings()
-    if settings.run is not None:
-        trained.algo.conditions(settings.beta, settings.collision_weight)
+    settings.conditions_of(trained)
     chosen = settings.world_of(trained)
     WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=chosen.robot)
     check_maps(chosen.maps, chosen.task.min_path_m, chosen.robot.circumradius_m)
@@ -51,6 +50,7 @@ def look_at_calibration(cfg: DictConfig) -> None:
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is not None:
         trained = find_agent(settings.run).settings()
+        settings.horizon_in(trained.task.episode_steps)
         check_maps(trained.map, trained.task.min_path_m, trained.robot.circumradius_m)
     _look_at_out(settings.out)
 

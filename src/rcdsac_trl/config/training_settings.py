@@ -133,10 +133,14 @@ class TrainingSettings:
     # Runs of earlier versions name none: this is what they had.
     collector: CollectorSettings = SINGLE
     robot: RobotSettings = PAPER
+    # Those began with random weights.
+    init: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together, or not this machine."""
         check_least("seed", self.seed, 0)
+        if self.init is not None and not self.init.strip():
+            raise UserInputError("init names no agent: give a run folder, an exported folder or a shipped agent")
         runtime.check_device_name(self.device)
         runtime.resolve_threads(self.threads)
         self.collector.check_agents(self.world.num_agents)

@@ -13,7 +13,21 @@ import sys
 from functools import partial
 from typing import Any
 
-import rclpy
+from rcdsac_trl.errors import UserInputError
+
+try:
+    import rclpy
+except ModuleNotFoundError as error:
+    _sentence = (
+        f"this Python ({sys.version_info.major}.{sys.version_info.minor}) has no rclpy ({error}): source a ROS 2 that "
+        "was built for it (source /opt/ros/<distribution>/setup.bash), or drive without ROS: "
+        "python -m rcdsac_trl.deploy.dds_node <agent>"
+    )
+    if __name__ != "__main__":
+        raise UserInputError(_sentence) from error
+    print(f"rcdsac_trl: {_sentence}", file=sys.stderr)
+    raise SystemExit(2) from None
+
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import SetParametersResult

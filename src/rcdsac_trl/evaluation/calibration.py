@@ -55,11 +55,7 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
             f"run={settings.run} has {trained.algo.critic} critics, which predict no quantiles: name an agent of "
             "another row"
         )
-    if not 0 < settings.horizon_steps < trained.task.episode_steps:
-        raise UserInputError(
-            f"horizon_steps={settings.horizon_steps} must be below the {trained.task.episode_steps} steps of an "
-            "episode, so that states can be met in it: shorten it"
-        )
+    settings.horizon_in(trained.task.episode_steps)
     conditions = trained.algo.conditions(settings.beta, None)
     if settings.cross_evaluate and len(conditions) < 2:
         raise UserInputError(
@@ -70,7 +66,10 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
     loss = named.load_critics()
     processes = resolve_processes(settings.num_workers, settings.num_maps)
     simulations = max(1, processes) * len(conditions) * settings.num_states * settings.num_rollouts
-    remedy = "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, or end other programs"
+    remedy = (
+        "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, give fewer values of beta, or end "
+        "other programs"
+    )
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
 
     def maps(watch: Watch) -> Generator[Rows, None, None]:
@@ -114,7 +113,7 @@ def _described(settings: CalibrationSettings, named: NamedAgent, conditions: Seq
         "num_maps": settings.num_maps,
         "num_states": settings.num_states,
         "num_rollouts": settings.num_rollouts,
-        "horizon_steps": settings.horizon_steps,
+        "horizon_steps": settings.horizon_in(trained.task.episode_steps),
         "memory_steps": trained.learner.sequence_length,
         "gamma": trained.learner.gamma,
         "target_over_critics": trained.learner.target_over_critics,
@@ -152,7 +151,8 @@ def _driver(
         state_size=trained.network.state_size,
         conditions=[condition for condition in conditions for _ in range(group)],
     )
-    latest = trained.task.episode_steps - settings.horizon_steps
+    horizon_steps = settings.horizon_in(trained.task.episode_steps)
+    latest = trained.task.episode_steps - horizon_steps
     betas = [condition.beta for condition in conditions]
 
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
@@ -165,7 +165,7 @@ def _driver(
             conditioned=trained.algo.network_measure is not None,
             branch_steps=steps,
             num_rollouts=settings.num_rollouts,
-            horizon_steps=settings.horizon_steps,
+            horizon_steps=horizon_steps,
             memory_steps=trained.learner.sequence_length,
             gamma=trained.learner.gamma,
             generator=torch_stream(settings.seed, "calibration actions", map_index),
@@ -179,7 +179,7 @@ def _driver(
                 betas=betas,
                 branch_steps=steps,
                 num_rollouts=settings.num_rollouts,
-                horizon_steps=settings.horizon_steps,
+                horizon_steps=horizon_steps,
                 gamma=trained.learner.gamma,
                 generator=torch_stream(settings.seed, "cross-evaluation actions", map_index),
                 map_index=map_index,

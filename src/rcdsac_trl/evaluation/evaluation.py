@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.config.conditions import Condition
+from rcdsac_trl.config.command_line import listed
 from rcdsac_trl.config.evaluation_settings import ChosenWorld, EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.run_config import read_config
@@ -87,9 +87,10 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
         headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in spec.conditions]
         return write_film(spec, agent(), settings.video, headings, folder)
 
+    out = Path(settings.out) if settings.out is not None else _default_out(settings, spec, named, num_maps)
     return MeasuredRun(
         kind="barn" if worlds else "evaluation",
-        out=Path(settings.out) if settings.out is not None else _default_out(settings, spec, named, num_maps),
+        out=out,
         described=_described(settings, spec, named, num_maps),
         unit="map",
         num_units=num_maps,
@@ -98,15 +99,12 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
         measure=maps,
         findings=partial(barn_runs, worlds) if worlds else _findings,
         film=film if settings.record else None,
+        next_step=() if worlds else ("report", listed("runs", out.as_posix())),
     )
 
 
 def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: ChosenWorld) -> EvaluationSpec:
-    conditions = [Condition()]
-    if settings.run is not None:
-        conditions = trained.algo.conditions(settings.beta, settings.collision_weight)
-    controllers = settings.beta_controller or ()
-    conditions += [Condition(controller=name) for name in controllers]
+    conditions = settings.conditions_of(trained)
     return EvaluationSpec(
         trained=trained,
         world=_evaluation_world(settings, trained, chosen, len(conditions)),
@@ -118,7 +116,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: Chose
         device=runtime.resolve_device(settings.device),
         threads=1 if settings.threads == "auto" else settings.threads,
         detailed=True,
-        controller=settings.controller if controllers else None,
+        controller=settings.controller if settings.beta_controller else None,
         baseline=settings.baseline or PURSUIT,
         one_trip=chosen.barn is not None,
         navigation=settings.navigation,
@@ -175,14 +173,12 @@ def _findings(rows: Rows) -> Findings:
     measured = table_of([rows])
     collisions, episodes = collision_table(measured), measured.drop(columns=COLLISIONS)
     summary = summarise(episodes, [key for key in CONDITION_COLUMNS if key in episodes])
-    shown = summary.dropna(axis="columns", how="all").set_index("episodes")
     return Findings(
         {
             "episodes.csv": episodes.to_csv(index=False, float_format="%.9g"),
             "summary.csv": summary.to_csv(index=False, float_format="%.6g"),
             "collisions.csv": collisions.to_csv(index=False, float_format="%.6g"),
-        },
-        text=shown.T.to_string(header=True, float_format="{:.3f}".format, na_rep=""),
+        }
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from rcdsac_trl.rollout.evaluation_pool import Rows
 from rcdsac_trl.storage.results_folder import UNFINISHED, ResultsFolder
 from rcdsac_trl.system.interrupts import at_safe_points
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.system.progress import Watch, Work, counted
 
 
@@ -19,11 +20,9 @@ class Findings:
 
     Attributes:
         tables: contents of the files, by name.
-        text: what is printed of them, if anything.
     """
 
     tables: Mapping[str, str]
-    text: str | None = None
 
 
 class MeasuredRun:
@@ -40,6 +39,7 @@ class MeasuredRun:
         measure: yields the rows of each unit once it is measured, in any order; tells how many steps are done.
         findings: makes the tables of the rows of all units.
         film: makes films of them, given the folder and the rows, and returns the files; None: there are none.
+        next_step: verb and overrides of what a user does next, which is told at the end; empty: nothing is.
 
     Raises:
         UserInputError: if the folder holds something else, or cannot be written.
@@ -58,6 +58,7 @@ class MeasuredRun:
         measure: Callable[[Watch], Generator[Rows, None, None]],
         findings: Callable[[Rows], Findings],
         film: Callable[[Path, Rows], Sequence[Path]] | None = None,
+        next_step: Sequence[str] = (),
     ) -> None:
         self.results = ResultsFolder(out, f"{kind}.json", described)
         self.measure = measure
@@ -67,6 +68,7 @@ class MeasuredRun:
         self._processes = processes
         self._findings = findings
         self._film = film
+        self._next_step = next_step
 
     def run(self, describe: Callable[[Path], str] | None = None) -> None:
         """Measure, write, and print what was found.
@@ -82,8 +84,6 @@ class MeasuredRun:
         rows = self._measured()
         found = self._findings(rows)
         self.results.write(found.tables)  # first: what follows may find the disk full that the output goes to
-        if found.text is not None:
-            print(found.text)
         if describe is not None:
             with Work("tables and figures of them", 1, "report"):
                 described = describe(self.results.path)
@@ -91,6 +91,8 @@ class MeasuredRun:
         print(f"written to {self.results.path}")
         if self._film is not None:
             print(f"filmed: {', '.join(map(str, self._film(self.results.path, rows)))}")
+        if self._next_step:
+            print(f"next: {' '.join([program(), *self._next_step])}")
 
     def _measured(self) -> Rows:
         """Measure all units, and keep the tables of those that have ended."""

@@ -23,6 +23,7 @@ from rcdsac_trl.experiments.search_space import Searched, searched_in
 from rcdsac_trl.experiments.sweep import Job, State, execute
 from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.storage.atomic import FolderLock
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.tables import read_growing
 
 if TYPE_CHECKING:
@@ -230,4 +231,4 @@ class Search:
             return
         best = self.study.best_trial
         print(f"best {best.value:.1f} {self.folder / best.user_attrs[_FOLDER]}")
-        print(f"python -m rcdsac_trl.train {' '.join(self.trial.overrides)} {self._as_overrides(best.params)}")
+        print(f"{program()} train {' '.join(self.trial.overrides)} {self._as_overrides(best.params)}")

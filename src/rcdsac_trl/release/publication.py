@@ -7,6 +7,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy import Policy
@@ -18,6 +19,7 @@ from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.storage import atomic
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.system.resources import check_writable
 
 # What stays of a run, where it has it: enough for every table and figure of a report.
@@ -132,7 +134,7 @@ def _evaluation_of(run: Path, checkpoint: Name) -> Path:
     if not found:
         raise UserInputError(
             f"{run} has no evaluation of its checkpoint {checkpoint}: "
-            f"python -m rcdsac_trl.evaluate run={run} checkpoint={checkpoint}"
+            f"{program()} evaluate {assigned('run', run.as_posix())} checkpoint={checkpoint}"
         )
     return max(found, key=lambda folder: found[folder])
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from rcdsac_trl.report.collision_report import write_collisions
+from rcdsac_trl.report.evaluation_summary import summarised
 from rcdsac_trl.report.read import BARN
 from rcdsac_trl.report.statistics import Interval, bootstrap
 
@@ -25,7 +25,7 @@ def describe_evaluation(folder: Path) -> str:
     Args:
         folder: that ``evaluate`` wrote.
     """
-    return write_barn(folder) if (folder / BARN).is_file() else write_collisions(folder)
+    return write_barn(folder) if (folder / BARN).is_file() else summarised(folder)
 
 
 def write_barn(folder: Path) -> str:

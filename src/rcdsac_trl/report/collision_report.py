@@ -98,13 +98,12 @@ def _unless_missing(value: float, form: str) -> str:
     return "" if pd.isna(value) else form.format(value)
 
 
-def write_collisions(folder: Path) -> str:
-    """Write ``collision_summary.csv`` of a folder that ``evaluate`` wrote; return it as text."""
+def write_collisions(folder: Path) -> pd.DataFrame:
+    """Write ``collision_summary.csv`` of a folder that ``evaluate`` wrote, and return it."""
     evaluation = read_evaluation(folder)
     episodes, collisions = evaluation.episodes, evaluation.collisions
     assert collisions is not None  # evaluate has just written it
     by = [key for key in TOLD if key in episodes]
     summary = collision_summary(collisions, episodes, episodes[by].drop_duplicates(), by)
     summary.to_csv(folder / "collision_summary.csv", index=False, float_format="%.6g")
-    shown = summary.dropna(axis="columns", how="all")
-    return str(shown.to_string(index=False, float_format="{:.3g}".format, na_rep=""))
+    return summary

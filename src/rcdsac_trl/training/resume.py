@@ -113,6 +113,8 @@ def _own_overrides(folder: Path) -> list[str]:
 
 
 def _changes(own: list[str], override: str) -> bool:
+    # What `init` chose stands among them, and the agent it names may be gone.
+    own = [other for other in own if key_of(other) != "init"]
     others = [other for other in own if key_of(other) != key_of(override)]
     return _comparable(compose("train", own)) != _comparable(compose("train", [*others, override]))
 

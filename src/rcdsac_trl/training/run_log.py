@@ -1,6 +1,7 @@
 """Everything that is written into a run folder while training."""
 
 import contextlib
+import os
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from torchrl.record.loggers import Logger
+from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 from torchrl.record.loggers.utils import get_logger
 from tqdm import tqdm
@@ -18,6 +20,20 @@ from rcdsac_trl.training.run_folder import lengths
 
 # Where the thread is defined that writes TensorBoard's files.
 _TENSORBOARD_WRITER = "tensorboard.summary.writer.event_file_writer"
+
+
+def _logger(backend: str, folder: Path) -> Logger:
+    """Make a logger of TorchRL that writes into a run folder; to a server where the user's environment names one."""
+    if backend == "wandb":
+        return get_logger(backend, logger_name=str(folder), experiment_name=folder.name)
+    if backend == "mlflow":
+        # A database, since MLflow takes folders of files no longer.
+        place = folder.resolve()
+        server = os.environ.get("MLFLOW_TRACKING_URI")
+        artifacts = None if server else (place / "mlartifacts").as_uri()
+        uri = server or f"sqlite:///{place / 'mlflow.db'}"
+        return MLFlowLogger(exp_name=folder.name, tracking_uri=uri, artifact_location=artifacts)
+    return get_logger(backend, logger_name=str(folder), experiment_name=backend)
 
 
 class RunLog:
@@ -31,9 +47,7 @@ class RunLog:
 
     def __init__(self, folder: Path, backends: Sequence[str], *, continued_at: int | None = None) -> None:
         self.folder = folder
-        self._loggers: list[Logger] = [
-            get_logger(name, logger_name=str(folder), experiment_name=name) for name in backends
-        ]
+        self._loggers: list[Logger] = [_logger(name, folder) for name in backends]
         self._file = (folder / "train.log").open("a", buffering=1, encoding="utf-8")
         self._excepthook = threading.excepthook
         threading.excepthook = self._thread_failed

@@ -35,6 +35,7 @@ from rcdsac_trl.training.run_folder import check_folder, cut, has_begun, start_r
 from rcdsac_trl.training.run_log import RunLog
 from rcdsac_trl.training.trainer import IterationHook, Trainer, saved_sentence
 from rcdsac_trl.training.validation import Snapshot, SnapshotEvaluator, Validation
+from rcdsac_trl.training.warm_start import begin_with_agent
 from rcdsac_trl.world.maps.map_source import check_maps
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 
@@ -166,12 +167,14 @@ def make_trainer(
         "matrix_products": matmul.LIBRARY,
     }
     check_folder(folder)
-    learner = _learner_here(settings)  # before anything is written: it may not fit into the memory
+    # Before anything is written: it may not fit into the memory, or not be that of `init`.
+    learner = _learner_here(settings)
+    messages = [] if settings.init is None else [begin_with_agent(learner, settings)]
     folder.mkdir(parents=True, exist_ok=True)
     lock = FolderLock(folder)
     try:
         start_run_folder(folder, cfg, facts)
-        return _assemble(settings, learner, folder, lock, None, [], on_iteration_end)
+        return _assemble(settings, learner, folder, lock, None, messages, on_iteration_end)
     except BaseException:
         lock.close()
         raise
@@ -197,7 +200,10 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
                 rotate(folder / CHECKPOINTS, keep=settings.checkpoint.keep, replay=folder / REPLAY)
             lock.close()
             return None
-        return _assemble(settings, _learner_here(settings), folder, lock, saved, damaged, on_iteration_end)
+        learner, messages = _learner_here(settings), list(damaged)
+        if saved is None and settings.init is not None:
+            messages.append(begin_with_agent(learner, settings))
+        return _assemble(settings, learner, folder, lock, saved, messages, on_iteration_end)
     except BaseException:
         lock.close()
         raise

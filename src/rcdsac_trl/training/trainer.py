@@ -85,6 +85,11 @@ class Trainer:
         self.on_iteration_end = on_iteration_end
         self._iteration = progress.iterations  # under way, from 0
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether every iteration of the schedule is done."""
+        return self.progress.iterations == self.schedule.iterations
+
     def run(self) -> None:
         """Train to the end of the schedule; what is done after the last checkpoint is lost if it ends early.
 

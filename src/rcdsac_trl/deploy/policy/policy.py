@@ -1,6 +1,7 @@
 """The object that drives: observations in, a velocity command and the risk of it out, one call a control period."""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,6 +20,7 @@ from rcdsac_trl.deploy.policy.input_checks import (
     velocity_of,
     waypoints_of,
 )
+from rcdsac_trl.deploy.policy.observed import observed
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
 from rcdsac_trl.errors import UserInputError
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 # After so many calls without good input in a row, or so many of the longest periods of training without one, the memory
 # is of another situation.
 _FORGET_AFTER = 3
-_RECOVERS = "it drives on with the next good input"
+_RECOVERS = "it stands until good input comes"
 _AT_ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -49,6 +51,12 @@ def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
     if not (is_whole_number(num_quantiles) and num_quantiles >= 1):
         raise UserInputError(f"num_quantiles={num_quantiles} is no whole number of 1 or more: ask for at least one")
     return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
+
+
+def _span(values: Sequence[float], digits: int) -> str:
+    """Write the smallest and the largest of some numbers, or the only one."""
+    low, high = (f"{value:.{digits}f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
 
 
 def _memory_of(memory_s: float, sensed: NDArray[np.bool_], robot: RobotSettings) -> "RememberedRanges | None":
@@ -96,6 +104,7 @@ class Policy:
     Attributes:
         config: what the agent is.
         robot: that it drives.
+        record: what its card says of how it drives; empty where it says nothing.
         fractions: of the quantiles, the midpoints of equal parts of [0, 1], float32 [N].
         default_beta: what ``beta`` is where none is given, the middle of the trained range (-1 for the power law);
             None for an agent that is told none.
@@ -114,6 +123,7 @@ class Policy:
         navigator: "Navigator | None" = None,
     ) -> None:
         self.config = weights.config
+        self.record = weights.record
         self.robot = self.config.robot
         self.guard = _guard_of(self.robot, guard)
         self.limits = limits
@@ -155,13 +165,87 @@ class Policy:
         self._noise = stream(0, "drawn actions of a policy")
         if self.navigator is not None:
             self.navigator.reset()
+        self._others: list[Policy] = []
+
+    def __repr__(self) -> str:
+        """Say what the agent is, and what its card says of how it drives."""
+        config = self.config
+        parts = [config.name, f"sensor {config.sensor}"]
+        if config.memory_s > 0.0:
+            parts.append(f"remembers {config.memory_s:g} s")
+        if config.context is not None and config.context_range is not None:
+            parts.append(f"{config.context} in [{config.context_range[0]:g}, {config.context_range[1]:g}]")
+        elif config.fixed_beta is not None:
+            parts.append(f"for beta={config.fixed_beta:g} alone")
+        parts.append(f"robot {self.robot.name}")
+        if self.record:
+            collisions, rewards = [r.collisions for r in self.record], [r.reward for r in self.record]
+            parts.append(f"an episode: collisions {_span(collisions, 2)}, reward {_span(rewards, 0)}")
+        return f"Policy({', '.join(parts)})"
 
     def __copy__(self) -> "Policy":
         """Copy the situation, and share what never changes."""
         copied = object.__new__(type(self))
         own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_remembered", "navigator", "_noise")}
+        own["_others"] = [copy.copy(other) for other in self._others]
         copied.__dict__ |= self.__dict__ | own
         return copied
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """What the agent was trained to see with and drive, as an environment takes it: sensor, memory and robot."""
+        return {"sensor": self.config.sensor, "memory_s": self.config.memory_s, "robot": self.robot}
+
+    def act_on(
+        self, observation: Any, beta: float | None = None, *, collision_weight: float | None = None
+    ) -> NDArray[np.float32]:
+        """Return the action for an observation of the Gymnasium or the TorchRL environment.
+
+        Call it once in every step. It does what :meth:`act` does for a robot, without guard, :meth:`stop` and the
+        checks of what a robot's sensors say. Call :meth:`reset` when an episode begins; a TorchRL environment with an
+        ``InitTracker`` says so itself.
+
+        Args:
+            observation: what the environment returned, a dict or a TensorDict, of one agent or of many: each has a
+                memory of its own.
+            beta: as in :meth:`act`.
+            collision_weight: as in :meth:`act`.
+
+        Returns:
+            float32 [2], each in [-1, 1]; [N, 2] of N agents.
+
+        Raises:
+            UserInputError: if the observation is of another sensor or memory than the agent's, or :meth:`act` would
+                refuse `beta` or `collision_weight`.
+
+        Example:
+            >>> import gymnasium, rcdsac_trl
+            >>> policy = rcdsac_trl.load("rcdsac_pow-narrow")
+            >>> env = gymnasium.make("RCDSACNavigation-v0", map="easy", **policy.world)
+            >>> observation, _ = env.reset(seed=0)
+            >>> policy.act_on(observation, beta=-1.0).shape
+            (2,)
+        """
+        seen = observed(observation, self.config)
+        try:
+            context = self._context(beta, collision_weight)
+        except BadInputError as error:
+            raise UserInputError(str(error)) from None
+        agents = self._agents(len(seen.bins))
+        for agent in np.flatnonzero(seen.begins):
+            agents[agent]._forget()
+        actions = [
+            agent._see(bins, vectors, context).action
+            for agent, bins, vectors in zip(agents, seen.bins, seen.vectors, strict=True)
+        ]
+        return np.array(actions, dtype=np.float32).reshape(*seen.batch, 2)
+
+    def _agents(self, number: int) -> "list[Policy]":
+        """Return this one and others with memories of their own, which are there until a :meth:`reset`."""
+        if len(self._others) != number - 1:
+            self.reset()
+            self._others = [copy.copy(self) for _ in range(number - 1)]
+        return [self, *self._others]
 
     def foresee(self, beta: float | None = None, *, action: Any = None) -> Outlook:
         """Return what the agent would do with another `beta` where it stands now, and what it expects of that.
@@ -333,14 +417,16 @@ class Policy:
         context: float | None,
         elapsed_s: float,
     ) -> None:
-        config = self.config
         bins = range_observation(sectors.distances_m, self._mask, self.robot.lidar.max_range_m)
         vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
         if self._remembered is not None:
             vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
-        if config.context == "collision_weight" and context is not None:
-            vectors.append(context)
-        told = np.array(vectors, dtype=np.float32)
+        self._see(bins, vectors, context)
+
+    def _see(self, bins: Array, vectors: Sequence[float] | Array, context: float | None) -> Outlook:
+        """Let the networks take a step, and return what they want and expect."""
+        weight = (context,) if self.config.context == "collision_weight" and context is not None else ()
+        told = np.array((*vectors, *weight), dtype=np.float32)
         self._states = self._encoders.step(bins, told, self._states)
         self._read = self._encoders.heads_read(self._states, told)
         self._steps += 1
@@ -352,6 +438,7 @@ class Policy:
         outlook = self._outlook(embedded, drawn)
         self._wanted = outlook.wanted
         self._told = outlook.quantiles, outlook.value
+        return outlook
 
     def _embedded(self, context: float | None) -> float | None:
         """Return what the heads are told; None where they are told nothing."""

@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from rcdsac_trl.deploy.policy.driving_record import DrivingRecord, driving_record
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, NUM_LOOK_AHEAD
 from rcdsac_trl.robot.observation import RangeCode, vector_observations
@@ -221,7 +222,7 @@ class AgentConfig:
 
 @dataclass(frozen=True)
 class Weights:
-    """An agent: what it is, and its tensors by name, float32.
+    """An agent: what it is, its tensors by name, float32, and what its card says of how it drives, if anything.
 
     Raises:
         UserInputError: if a tensor is missing, superfluous, of another shape or type, or not finite.
@@ -229,6 +230,7 @@ class Weights:
 
     config: AgentConfig
     tensors: Mapping[str, NDArray[np.float32]]
+    record: tuple[DrivingRecord, ...] = ()
 
     def __post_init__(self) -> None:
         """Compare the tensors with what the configuration says, and make them read-only."""
@@ -246,9 +248,9 @@ class Weights:
                 raise UserInputError(f"{name} holds numbers that are not finite: this agent cannot drive")
         object.__setattr__(self, "tensors", MappingProxyType(dict(self.tensors)))
 
-    def __reduce__(self) -> tuple[type["Weights"], tuple[AgentConfig, dict[str, NDArray[np.float32]]]]:
+    def __reduce__(self) -> tuple[type["Weights"], tuple[Any, ...]]:
         """Pickle and copy what the views of mappings are of: they themselves cannot be."""
-        return Weights, (self.config, dict(self.tensors))
+        return Weights, (self.config, dict(self.tensors), self.record)
 
     def part(self, prefix: str) -> dict[str, NDArray[np.float32]]:
         """Return the tensors below a prefix, such as ``"actor.encoder"``, without it."""
@@ -309,11 +311,19 @@ def read_weights(folder: Path) -> Weights:
         raise UserInputError(f"{folder / WEIGHTS_NAME} is not what {CONFIG_NAME} says it is: export the agent anew")
     try:
         tensors = {name: _single(tensor) for name, tensor in load_tensors(content).items()}
-        return Weights(AgentConfig(**values), tensors)
+        return Weights(AgentConfig(**values), tensors, _record(folder))
     except UserInputError as error:
         raise UserInputError(f"{folder}: {error}") from error
     except (TypeError, ValueError, AttributeError, SafetensorError) as error:
         raise UserInputError(f"{folder} cannot be read ({error}): export the agent anew") from error
+
+
+def _record(folder: Path) -> tuple[DrivingRecord, ...]:
+    """Read the card; an agent drives without one."""
+    try:
+        return driving_record((folder / CARD_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return ()
 
 
 def _single(tensor: NDArray[Any]) -> NDArray[Any]:
@@ -329,7 +339,7 @@ def halved(weights: Weights) -> Weights:
     """
     with np.errstate(over="ignore"):  # a number that is not finite is refused
         tensors = {name: _single(value.astype(np.float16)) for name, value in weights.tensors.items()}
-    return Weights(weights.config, tensors)
+    return Weights(weights.config, tensors, weights.record)
 
 
 def packed(weights: Weights, *, half: bool = False, results: str = "") -> dict[str, bytes]:
@@ -370,7 +380,7 @@ def model_card(weights: Weights, results: str = "") -> str:
     driving = f"\n{results.strip()}\n" if results else ""
     return f"""# {config.name}, {config.sensor} sensor
 
-A navigation agent of [rcdsac_trl](https://pypi.org/project/rcdsac-trl/): recurrent actor and {config.num_critics}
+A navigation agent of rcdsac_trl: recurrent actor and {config.num_critics}
 {config.critic} critic(s), {parameters:,} parameters.
 
 ```python

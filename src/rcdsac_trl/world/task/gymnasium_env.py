@@ -1,4 +1,4 @@
-"""The navigation task for Gymnasium, registered as ``RCDSACNavigation-v0`` when this module is imported."""
+"""The navigation task for Gymnasium; ``gymnasium.make("RCDSACNavigation-v0")`` makes one."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,7 +11,6 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
-from rcdsac_trl.world.task import gymnasium_id
 from rcdsac_trl.world.task.agent_group import AgentGroup
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -147,6 +146,3 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
 def _box(key: str) -> gymnasium.spaces.Box:
     space = SPACES[key]
     return gymnasium.spaces.Box(space.low, space.high, dtype=np.float32)
-
-
-gymnasium_id.register()

@@ -8,4 +8,4 @@ def register() -> None:
     import gymnasium  # imported late: who only drives a robot needs none
 
     if ENV_ID not in gymnasium.registry:
-        gymnasium.register(ENV_ID, entry_point="rcdsac_trl.world.task.gymnasium_env:NavigationGymEnv")
+        gymnasium.register(ENV_ID, entry_point="rcdsac_trl.config.named_world:gymnasium_env")

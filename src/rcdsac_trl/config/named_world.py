@@ -1,0 +1,70 @@
+"""Environments by the names of ``conf/``, for who uses them from Python."""
+
+from pathlib import Path
+from typing import Any
+
+from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import RobotSettings
+from rcdsac_trl.world.maps.files.file_map import FileMapSettings
+from rcdsac_trl.world.maps.map_source import MapSource
+from rcdsac_trl.world.task.gymnasium_env import NavigationGymEnv
+from rcdsac_trl.world.task.world_settings import WorldSettings
+
+# Of these map sets a path says which maps they are.
+_OF_FILES = ("file", "barn")
+
+
+def named_world(**options: Any) -> WorldSettings:
+    """Return what an environment is made of, see :func:`rcdsac_trl.world_settings`."""
+    return WorldSettings(**_resolved(options))
+
+
+def gymnasium_env(world: WorldSettings | None = None, **options: Any) -> NavigationGymEnv:
+    """Make what ``gymnasium.make("RCDSACNavigation-v0", ..)`` returns.
+
+    Args:
+        world: what it is made of; None: the defaults.
+        options: of :class:`~rcdsac_trl.world.task.gymnasium_env.NavigationGymEnv`, and `map` and `robot` by name, see
+            :func:`rcdsac_trl.world_settings`.
+    """
+    return NavigationGymEnv(world, **_resolved(options))
+
+
+def _resolved(options: dict[str, Any]) -> dict[str, Any]:
+    """Return options with settings in place of names."""
+    resolved = dict(options)
+    if (named := resolved.pop("map", None)) is not None:
+        if "map_settings" in options:
+            raise UserInputError("map and map_settings both say which maps: give one of them")
+        resolved["map_settings"] = _maps(named)
+    if isinstance(robot := options.get("robot"), str):
+        resolved["robot"] = _robot(robot)
+    return resolved
+
+
+def _maps(named: str | Path | MapSource) -> MapSource:
+    if not isinstance(named, str | Path):
+        return named
+    generated = [name for name in choices("map") if name not in _OF_FILES]
+    if str(named) in generated:
+        return training_settings(_composed(f"map={named}")).map
+    if Path(named).exists():
+        return FileMapSettings(path=str(named))
+    raise UserInputError(
+        f"map={named} does not exist: choose one of {', '.join(generated)}, or a file that maps are read from"
+    )
+
+
+def _robot(name: str) -> RobotSettings:
+    if name not in choices("robot"):
+        raise UserInputError(
+            f"robot={name} does not exist: choose one of {', '.join(choices('robot'))}, or give a RobotSettings"
+        )
+    return training_settings(_composed(f"robot={name}")).robot
+
+
+def _composed(choice: str) -> Any:
+    """Compose the config of a training that makes a choice; which row it trains does not matter."""
+    return compose("train", ["+algo=sac", choice])

@@ -1,0 +1,171 @@
+"""A training that begins with an agent: it is that agent, of its kind, and what it is not given is said."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.objectives import LossModule
+
+import tiny
+from rcdsac_trl import train
+from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.release.named_agent import named_agent
+from rcdsac_trl.storage.checkpoint_record import load_progress
+from rcdsac_trl.system.invocation import program
+from rcdsac_trl.training.setup import make_trainer, resume_training
+from rcdsac_trl.training.trainer import Trainer
+from tiny import TINY
+
+CRITICS, TARGETS = "critic_network_params.", "target_critic_network_params."
+
+
+def settings(*overrides: str) -> TrainingSettings:
+    return training_settings(compose("train", list(overrides)))
+
+
+def begun(agent: str | Path, folder: Path, *overrides: str) -> Trainer:
+    return closed(make_trainer(compose("train", [f"init={agent}", *TINY, *overrides]), folder))
+
+
+def closed(trainer: Trainer) -> Trainer:
+    """End what a trainer holds open, as a run does; what it holds in memory stays."""
+    for held in (trainer.episodes, trainer.validation, trainer.log, trainer.lock):
+        held.close()
+    return trainer
+
+
+def assert_equal_states(one: torch.nn.Module, other: torch.nn.Module) -> None:
+    ours, theirs = one.state_dict(), other.state_dict()
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
+
+
+def targets_are_critics(loss: LossModule) -> bool:
+    state = loss.state_dict()
+    names = [name for name in state if name.startswith(CRITICS)]
+    assert names
+    return all(torch.equal(state[name], state[TARGETS + name.removeprefix(CRITICS)]) for name in names)
+
+
+# ------------------------------------------------------------------------------------------------ what is chosen
+def test_an_agent_goes_on_as_what_it_is() -> None:
+    shipped = named_agent("rcdsac_pow-narrow").settings
+    found = settings("init=rcdsac_pow-narrow", "map=hard")
+    assert (found.algo, found.sensor, found.robot) == (shipped.algo, shipped.sensor, shipped.robot)
+    assert found.network == shipped.network
+    assert found.network.padding == "none"  # which training's defaults are not
+    plain = settings("+algo=rcdsac_pow", "map=hard")
+    assert found.map == plain.map != shipped.map
+    assert found.learner == plain.learner  # hyper-parameters are today's
+    early = (found.schedule.pursuit_iterations, found.schedule.neutral_iterations, found.schedule.ramp_iterations)
+    assert early == (0, 0, 0)
+    assert plain.schedule.pursuit_iterations > 0
+
+
+def test_what_a_user_chooses_holds() -> None:
+    given = (
+        "+algo=rcdsac_cvar",
+        "sensor=sparse",
+        "schedule.pursuit_iterations=2",
+        "robot.max_speed_m_per_s=0.3",
+    )
+    for overrides in (("init=rcdsac_pow-narrow", *given), (*given, "init=rcdsac_pow-narrow")):
+        found = settings(*overrides)
+        assert (found.algo.name, found.sensor.name) == ("rcdsac_cvar", "sparse")
+        assert (found.schedule.pursuit_iterations, found.robot.max_speed_m_per_s) == (2, 0.3)
+        assert found.network.padding == "none"
+    assert settings("+algo=sac", "init=null").init is None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["init=nobody"], "^there is no agent 'nobody': shipped are "),
+        (["+algo=sac", "init=''"], "^init names no agent"),
+        (
+            ["init=rcdsac_pow-narrow", "algo.beta=-1"],
+            r"^algo\.beta=-1\S* does not go with ",
+        ),
+    ],
+)
+def test_what_is_no_agent_is_refused(overrides: list[str], told: str) -> None:
+    with pytest.raises(UserInputError, match=told):
+        settings(*overrides)
+
+
+# ------------------------------------------------------------------------------------------------ what is copied
+def test_a_finished_run_goes_on_as_another_run(tiny_run: Path, tmp_path: Path) -> None:
+    loss, average = named_agent(tiny_run, "last").load()
+    trainer = begun(tiny_run, tmp_path / "run", "schedule.iterations=1")
+    assert_equal_states(trainer.learner.loss, loss)
+    assert_equal_states(trainer.learner.average, average)
+    assert not targets_are_critics(trainer.learner.loss)
+    assert trainer.progress.iterations == trainer.progress.updates == 0
+    assert not trainer.learner.optimizer.state
+    told = f"begin with {tiny_run}; not copied: optimiser state, replay, random streams, schedule\n"
+    assert told in (tmp_path / "run" / "train.log").read_text()
+
+
+def test_it_trains_and_is_continued_also_where_the_agent_is_gone(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    agent = tiny.exported(tiny_run, tmp_path / "agent")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")
+    call = [f"init={agent}", *TINY, "hydra.run.dir=run"]
+    monkeypatch.setattr(sys, "argv", ["train", *call])
+    train.main()
+    told = capsys.readouterr().out
+    assert f"next: {program()} evaluate run=run\n" in told
+    assert f"{program()} plot_training run=run\n" in told
+    assert load_progress(Path("run/checkpoints"), "last").updates == tiny.UPDATES * tiny.ITERATIONS
+    assert json.loads(Path("run/manifest.json").read_text())["overrides"][0].startswith("++algo.name=")
+    shutil.rmtree(agent)
+    monkeypatch.setattr(sys, "argv", ["train", *call[1:-1], "resume=run"])
+    train.main()
+    assert capsys.readouterr().out.startswith("run is finished")
+
+
+def test_a_run_that_saved_nothing_begins_with_the_agent_again(tiny_run: Path, tmp_path: Path) -> None:
+    begun(tiny_run, tmp_path / "run")
+    trainer = resume_training(tmp_path / "run")
+    assert trainer is not None
+    assert_equal_states(closed(trainer).learner.loss, named_agent(tiny_run, "last").load()[0])
+
+
+def test_an_exported_agents_average_stands_for_what_it_lacks(tiny_run: Path, tmp_path: Path) -> None:
+    agent = tiny.exported(tiny_run, tmp_path / "agent")
+    trainer = begun(agent, tmp_path / "run")
+    loss, average = named_agent(tiny_run).load()
+    assert_equal_states(trainer.learner.average.module, average.module)
+    state = trainer.learner.loss.state_dict()
+    assert targets_are_critics(trainer.learner.loss)
+    for name, value in average.module.state_dict().items():
+        assert torch.equal(state[f"actor_network_params.{name}"], value)
+    assert trainer.learner.loss.alpha.item() == pytest.approx(loss.alpha.item(), rel=1e-6)
+    told = (tmp_path / "run" / "train.log").read_text()
+    stand_in = "learning actor and target critics (the averaged actor and the critics stand for them)"
+    assert f"not copied: {stand_in}, optimiser state, replay, random streams, schedule\n" in told
+
+
+def test_a_shipped_agent_on_another_map_robot_and_measure(tmp_path: Path) -> None:
+    trainer = begun(
+        "rcdsac_pow-narrow", tmp_path / "run", "+algo=rcdsac_cvar", "robot=turtlebot3_burger", "sensor=full"
+    )
+    told = (tmp_path / "run" / "train.log").read_text()
+    assert "not copied: temperature (unknown: learner.alpha_init=" in told
+    assert "; measure pow becomes cvar; sensor narrow becomes full; robot paper becomes turtlebot3_burger\n" in told
+    assert_equal_states(trainer.learner.average.module, named_agent("rcdsac_pow-narrow").load()[1].module)
+
+
+def test_other_networks_are_refused_before_anything_is_written(tiny_run: Path, tmp_path: Path) -> None:
+    for override in ("network.memory=64", "sensor.memory_s=5.0", "+algo=sac", "learner.num_critics=1"):
+        with pytest.raises(UserInputError, match=rf"^init={tiny_run} has other networks than this run .* leave out"):
+            begun(tiny_run, tmp_path / "run", override)
+    assert list(tmp_path.iterdir()) == []
