@@ -31,7 +31,7 @@ test: setup chromium ## run the tests
 	$(PYTEST)
 
 # Tests of the page open it in the system's Chromium. Where that is missing and may not be installed, they skip.
-chromium:
+chromium: ## install the browser that some tests open, where that may be done
 	@for name in chromium chromium-browser google-chrome; do command -v $$name >/dev/null && exit 0; done; \
 	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get -qq update && \
 	  DEBIAN_FRONTEND=noninteractive apt-get -qq install -y --no-install-recommends chromium >/dev/null; then exit 0; fi; \

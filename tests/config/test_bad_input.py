@@ -120,7 +120,7 @@ NOT_FINITE = [float("nan"), float("inf")]
 
 def test_every_key_of_a_training_refuses_what_it_cannot_be() -> None:
     """Each leaf by itself: what is neither its type nor finite never gets through."""
-    wrong_text_allowed = {"resume", "device", "name"}
+    wrong_text_allowed = {"resume", "init", "device", "name"}
     for at in PLACES:
         here = TRAINING
         for key in at:

@@ -437,7 +437,7 @@ def test_a_refusal_of_the_real_program(tmp_path: Path) -> None:
 
 
 def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else(
-    tiny_run: Path, tmp_path: Path
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = [f"run={tiny_run}", "beta=[-2,-1]"]
     here = tiny.evaluate(*given, f"out={tmp_path / 'here'}")
@@ -452,6 +452,7 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
     assert heading.startswith("rcdsac_pow, evaluation maps 1 × 2 episodes of 20 steps")
     assert (averse.split()[0], bolder.split()[0], written) == ("beta=-2", "beta=-1", "written to there")
     assert hit.startswith(("hit: ", "nothing was hit"))
+    monkeypatch.chdir(cwd)
     assert following == f"next: {program()} report runs=[there]"
     assert [path.name for path in cwd.iterdir()] == ["there"]
     assert {"collisions_mean", "collisions_std"} <= set(pd.read_csv(cwd / "there" / "summary.csv"))  # all numbers

@@ -209,7 +209,7 @@ MISTAKES = [
     ("search", f"{POW} learner.batch_size=-1"),
     ("evaluate", ""),
     ("evaluate", "run=nowhere"),
-    ("evaluate", "run=run"),
+    ("evaluate", "run=run beta=[3]"),
     ("evaluate", "run=run beta=[-3]"),
     ("evaluate", "baseline=pursuit task.episode_step=3"),
     ("evaluate", "baseline=pursuit sensor.name=wide"),

@@ -344,6 +344,8 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "b.map").write_text("type octile\nheight 9\nwidth 9\nmap\n" + 9 * (9 * "." + "\n"))
     more = ["map.unmapped_clutter_per_m2=0.02", "map.num_movers=1", "task.episode_steps=5"]
     evaluate("baseline=pursuit", "map=file", "map.path=[a.yaml,b.map]", *more, "out=file")
+    guarded = ["task.stop_zone_share=1", "task.episode_steps=5"]
+    evaluate("baseline=pursuit", "map=varied", *guarded, "out=varied")
     every = {(cls.__name__, field.name) for cls in classes for field in fields(cls)}
     assert every - reads.seen == ONLY_CHECKED
 

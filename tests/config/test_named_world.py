@@ -58,7 +58,10 @@ def test_a_path_is_a_map_of_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"map": "moon"}, "^map=moon does not exist: choose one of easy, hard, mixed, static, or a file that maps are"),
+        (
+            {"map": "moon"},
+            "^map=moon does not exist: choose one of crowded, easy, furnished, .*, varied, or a file that maps are",
+        ),
         ({"map": "file"}, "^map=file does not exist"),
         ({"map": "easy", "map_settings": MapSettings()}, "^map and map_settings both say which maps"),
         ({"robot": "r2d2"}, "^robot=r2d2 does not exist: choose one of jackal, paper, .*, or give a RobotSettings$"),

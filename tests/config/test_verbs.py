@@ -204,7 +204,7 @@ def completed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[
     ("line", "words"),
     [
         ("rcdsac-trl ev", ["evaluate "]),
-        ("rcdsac-trl pl", ["plot_training "]),
+        ("rcdsac-trl plo", ["plot_training "]),
         ("rcdsac-trl train sensor=", ["full", "narrow", "sparse"]),
         ("rcdsac-trl train +algo=s", ["sac "]),
         ("rcdsac-trl train seed=1 learner.ga", ["learner.gamma="]),

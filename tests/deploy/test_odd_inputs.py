@@ -295,7 +295,7 @@ def test_weights_and_policies_are_copied_whole(row: str, copied: Any) -> None:
 
 def test_weights_that_were_changed_on_the_way_are_refused() -> None:
     weights = agent()
-    make, (config, tensors) = weights.__reduce__()
+    make, (config, tensors, _) = weights.__reduce__()
     assert make is Weights
     tensors.pop("actor.head.output.bias")
     with pytest.raises(UserInputError, match=r"differ in actor\.head\.output\.bias"):

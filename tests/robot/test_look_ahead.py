@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rcdsac_trl.robot.foreseen_clearance import FORESEEN_ACTIONS, MIRRORED_COMMANDS, ForeseenClearance
-from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, look_ahead
+from rcdsac_trl.robot.foreseen_clearance import MIRRORED_COMMANDS, ForeseenClearance
+from rcdsac_trl.robot.look_ahead import FORESEEN_ACTIONS, FORESEEN_SIZE, look_ahead
 
 ACTIONS = np.array([(speed, turn) for speed, turns in FORESEEN_ACTIONS for turn in turns], np.float32)
 FORESEEN = np.random.default_rng(0).uniform(0.0, 1.6, FORESEEN_SIZE).astype(np.float32)

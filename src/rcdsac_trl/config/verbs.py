@@ -36,7 +36,7 @@ VERBS = {
     "play": Verb(
         does="drive an agent on a page in a browser, and turn beta while it drives",
         examples={
-            "": "a shipped agent; nothing to train",
+            "port=5008": "shipped agents, nothing to train; on another port than 5006",
             "run=runs/<folder>": "yours, beside the shipped ones",
             "browser=false port=5007": "on another machine: ssh -L 5007:localhost:5007",
         },

@@ -14,6 +14,7 @@ from rcdsac_trl.playground.play_server import LOOPBACK, PlayServer, what_it_mean
 from rcdsac_trl.system.progress import serving
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.maps.map_mixture import MapMixture
 
 _OF_FILES = ("file", "barn")
 
@@ -65,8 +66,9 @@ def serve(offers: Offers, settings: PlaySettings) -> PlayServer:
     )
 
 
-def _map_settings(name: str) -> MapSettings:
-    return read(MapSettings, plain(compose("draw_maps", [f"map={name}"]))["map"], "map")
+def _map_settings(name: str) -> MapSettings | MapMixture:
+    values = plain(compose("draw_maps", [f"map={name}"]))["map"]
+    return read(MapMixture, values, "map") if "families" in values else read(MapSettings, values, "map")
 
 
 def _file_settings(path: str) -> FileMapSettings:

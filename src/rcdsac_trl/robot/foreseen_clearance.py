@@ -13,17 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.look_ahead import FORESEEN_ACTIONS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
-
-FORESEEN_ACTIONS: tuple[tuple[float, tuple[float, ...]], ...] = (
-    (1.0, (-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0)),
-    (0.25, (-1.0, -2.0 / 3.0, -1.0 / 3.0, 0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0)),
-    (-0.5, (-1.0, 0.0, 1.0)),
-    (-1.0, (-0.5, 0.0, 0.5)),
-)
-"""Rows of actions, each its first number and the second ones from right to left. Of the paper's robot the rows are
-full speed, half of it, standing, and backwards."""
 
 _ACTIONS = np.array([(speed, turn) for speed, turns in FORESEEN_ACTIONS for turn in turns])
 
@@ -47,7 +39,7 @@ class ForeseenClearance:
         robot: its limits, and from where distances count.
 
     Attributes:
-        commands: float64 [22, 2], in m/s and rad/s, those of :data:`FORESEEN_ACTIONS`.
+        commands: float64 [22, 2], in m/s and rad/s, those of :data:`~rcdsac_trl.robot.look_ahead.FORESEEN_ACTIONS`.
 
     Example:
         >>> clearance = ForeseenClearance()

@@ -45,7 +45,7 @@ _CREEP_M_PER_S, _WORTH_IT = 0.2, 0.5
 # The robot turns away from what it cannot pass at this share of its fastest turn, by headings so many sectors apart.
 _TURN_SHARE, _HEADING_BINS = 0.5, 5
 # Beside where the robot has been, its edge may come by this much: what the places between two calls leave open.
-_BESIDE_M = 0.01
+_BESIDE_M = 0.004
 _EDGE = np.stack(
     (np.cos(np.arange(0.0, 2.0 * math.pi, math.pi / 12)), np.sin(np.arange(0.0, 2.0 * math.pi, math.pi / 12))), axis=1
 )

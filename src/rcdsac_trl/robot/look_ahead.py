@@ -1,8 +1,8 @@
 """What foreseen clearances say of one action: interpolated over the actions that they were computed for.
 
 A critic that is told how near *this* action leads need not learn to look it up, and its slope along the action says
-which way there is more room. Between the actions of :data:`~rcdsac_trl.robot.foreseen_clearance.FORESEEN_ACTIONS` it is
-linear along both axes: over the turns of a row, then from row to row.
+which way there is more room. Between the actions of :data:`FORESEEN_ACTIONS` it is linear along both axes: over the
+turns of a row, then from row to row.
 """
 
 from itertools import pairwise
@@ -10,8 +10,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.robot.foreseen_clearance import FORESEEN_ACTIONS
 from rcdsac_trl.robot.observation import NUM_FORESEEN_COMMANDS
+
+FORESEEN_ACTIONS: tuple[tuple[float, tuple[float, ...]], ...] = (
+    (1.0, (-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0)),
+    (0.25, (-1.0, -2.0 / 3.0, -1.0 / 3.0, 0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0)),
+    (-0.5, (-1.0, 0.0, 1.0)),
+    (-1.0, (-0.5, 0.0, 0.5)),
+)
+"""Rows of actions, each its first number and the second ones from right to left. Of the paper's robot the rows are
+full speed, half of it, standing, and backwards."""
 
 NUM_LOOK_AHEAD = 2
 """Numbers that are told of an action: how near it leads soon, and later."""
