@@ -143,12 +143,15 @@ def test_the_program_says_where_it_is_and_ends_with_ctrl_c(tmp_path: Path) -> No
     with subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as run:
-        assert run.stdout is not None
-        said = run.stdout.readline().decode()
-        found = re.match(r"http://localhost:(\d+)/ drives ", said)
-        assert found, said
-        assert "<title>" in _read(f"http://localhost:{found[1]}/")
-        run.send_signal(signal.SIGINT)
-        _, told = run.communicate(timeout=120)
+        try:
+            assert run.stdout is not None
+            said = run.stdout.readline().decode()
+            found = re.match(r"http://localhost:(\d+)/ drives ", said)
+            assert found, said
+            assert "<title>" in _read(f"http://localhost:{found[1]}/")
+            run.send_signal(signal.SIGINT)
+            _, told = run.communicate(timeout=120)
+        finally:
+            run.kill()  # harmless where it has ended; else the test would wait for it for good
     assert told.decode().splitlines()[-1] == "rcdsac_trl: interrupted"
     assert not list(tmp_path.iterdir())

@@ -103,7 +103,7 @@ def test_slow_motors_reach_their_share_of_what_they_are_told() -> None:
 
 
 def test_a_stop_zone_keeps_the_robot_from_what_its_sensor_sees() -> None:
-    """Told to drive straight on for good, the robot hits the next wall, or stands before it and is told so."""
+    """Told to drive straight on for good, the robot hits the next wall, or is turned along it and told so."""
     ended = {}
     for share in (0.0, 1.0):
         made = group(TaskSettings(stop_zone_share=share))
@@ -116,7 +116,7 @@ def test_a_stop_zone_keeps_the_robot_from_what_its_sensor_sees() -> None:
     assert ended[0.0][0]
     assert ended[0.0][1][2] == pytest.approx(0.6)
     assert not ended[1.0][0]
-    assert ended[1.0][1] == pytest.approx([0.0] * 4, abs=1e-6)
+    assert ended[1.0][1][2] < 0.6
 
 
 def test_as_many_episodes_have_a_stop_zone_as_the_task_says() -> None:

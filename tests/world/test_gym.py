@@ -30,7 +30,10 @@ def test_what_is_no_setting_and_no_option_is_refused() -> None:
             NavigationGymEnv(memory_s=odd)
     with pytest.raises(UserInputError, match="robot='jackal' is no robot: give a RobotSettings"):
         NavigationGymEnv(robot="jackal")
-    with pytest.raises(UserInputError, match=r"map_settings='room\.json' are none: give a MapSettings, or FileMap"):
+    with pytest.raises(
+        UserInputError,
+        match=r"map_settings='room\.json' are none: give a MapSettings, a MapMixture of them, or FileMap",
+    ):
         NavigationGymEnv(map_settings="room.json")
     env = NavigationGymEnv(map_settings=SMALL, memory_s=np.float32(9.0))
     for options in ("x", 5, ["episode"]):
@@ -41,6 +44,7 @@ def test_what_is_no_setting_and_no_option_is_refused() -> None:
 
 @pytest.mark.parametrize("sensor", ["narrow", "sparse", "full"])
 def test_gymnasiums_own_check_passes(sensor: str) -> None:
+    rcdsac_trl.register_gym()  # another test may have imported the package before Gymnasium
     env = gymnasium.make(ENV_ID, map_settings=SMALL, sensor=sensor, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.close()

@@ -43,8 +43,8 @@ class ForeseenClearance:
 
     Example:
         >>> clearance = ForeseenClearance()
-        >>> clearance.commands[[0, 4, 12, 17, 20]].round(2).tolist()
-        [[0.6, -1.57], [0.6, 0.0], [0.3, 0.0], [0.0, 0.0], [-0.2, 0.0]]
+        >>> clearance.commands[[0, 4, 12, 20]].round(2).tolist()
+        [[0.6, -1.57], [0.6, 0.0], [0.3, 0.0], [-0.2, 0.0]]
         >>> ahead = np.array([[0.84 + 0.28, 0.0]])  # full speed ahead ends 0.28 m before it
         >>> told = clearance.nearness(ahead, np.empty((0, 6)), np.zeros(3), v=0.6, omega=0.0)
         >>> [round(float(each), 2) for each in told[[4, 22 + 4]]]  # within 0.42 s it comes no nearer than 0.87 m
