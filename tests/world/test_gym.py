@@ -32,7 +32,7 @@ def test_what_is_no_setting_and_no_option_is_refused() -> None:
         NavigationGymEnv(robot="jackal")
     with pytest.raises(
         UserInputError,
-        match=r"map_settings='room\.json' are none: give a MapSettings, a MapMixture of them, or FileMap",
+        match=r"map_settings='room\.json' are none: give a MapSettings, a MapMixture",
     ):
         NavigationGymEnv(map_settings="room.json")
     env = NavigationGymEnv(map_settings=SMALL, memory_s=np.float32(9.0))
