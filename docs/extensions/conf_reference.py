@@ -46,21 +46,24 @@ def _page(title: str, paths: list[Path]) -> str:
 
 def _section(path: Path) -> Iterator[str]:
     """Yield what one file says."""
-    is_root = path.parent == CONF_DIR
     yield f"\n## {path.stem}\n"
-    if is_root and path.stem in VERBS:
-        yield f"{_escaped(VERBS[path.stem].does)}:\n"
-        for call, does in VERBS[path.stem].examples.items():
+    if path.parent == CONF_DIR and path.stem in VERBS:
+        verb = VERBS[path.stem]
+        yield f"{_escaped(verb.does[0].upper() + verb.does[1:])}.\n"
+        for call, does in verb.examples.items():
             yield f"- `rcdsac-trl {path.stem} {call}`: {_escaped(does)}"
         yield ""
     text = path.read_text("utf-8")
-    yield f"{_escaped(_head(text))}\n"
+    if head := _head(text):
+        yield f"{_escaped(head)}\n"
     values = yaml.safe_load(text) or {}
     if parents := [f"`{name}`" for name in values.get("defaults", []) if isinstance(name, str) and name != "_self_"]:
         yield f"What is not said here is as in {', '.join(parents)}.\n"
     if values:
         yield from _table(("group", "takes", "what it chooses"), explained_defaults(path))
-        yield from _table(("key", "value", "meaning"), explained_keys(path))
+        # Of Hydra's own keys those matter that somebody found worth a comment.
+        keys = (key for key in explained_keys(path) if key.comment or key.name.split(".")[0] != "hydra")
+        yield from _table(("key", "value", "meaning"), keys)
 
 
 def _head(text: str) -> str:
