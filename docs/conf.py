@@ -32,11 +32,12 @@ exclude_patterns = ["extensions"]
 myst_heading_anchors = 3
 # Blocks without a language are commands and keys.
 highlight_language = "none"
-# `--help` in prose keeps its two hyphens.
-smartquotes = False
+# Quotes stay as they are written; dashes are Sphinx's own, between a parameter and what it is.
+smartquotes_action = "D"
 # A single backtick is code in docstrings, as in Markdown.
 default_role = "code"
 autodoc_default_options = {"members": True}
+autodoc_preserve_defaults = True
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 napoleon_use_ivar = True

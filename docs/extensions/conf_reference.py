@@ -68,7 +68,7 @@ def _section(path: Path) -> Iterator[str]:
 
 def _head(text: str) -> str:
     """Return the comment that a file begins with, if it is not that of its first key."""
-    lines = text.splitlines()
+    lines = text.removeprefix("# @package _global_\n").splitlines()
     comment = list(takewhile(lambda line: line.startswith("#"), lines))
     is_of_file = [*lines, ""][len(comment)] in ("", "defaults:")
     return " ".join(line.removeprefix("#").strip() for line in comment) if is_of_file else ""
@@ -95,6 +95,6 @@ def _escaped(comment: str) -> str:
         >>> _escaped("[tb4] a * b, `a_b`, a_b; a|b")
         '\\\\[tb4\\\\] a \\\\* b, `a_b`, a\\\\_b; a\\\\|b'
     """
-    parts = comment.removeprefix("@package _global_").strip().split("`")
+    parts = comment.split("`")
     marked = (re.sub(r"([\\*_<>\[\]{}$#~])", r"\\\1", part) if i % 2 == 0 else part for i, part in enumerate(parts))
     return "`".join(marked).replace("|", r"\|")
