@@ -54,7 +54,7 @@ notebooks: setup ## run the notebooks anew, in place
 	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
 docs: setup ## build the documentation as a site: build/docs/html/index.html
-	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/doctrees docs build/docs/html
+	$(BIN)/python -m sphinx -E -W --keep-going -q -d build/docs/doctrees docs build/docs/html
 	@echo "Open build/docs/html/index.html in a browser."
 
 format: setup ## let ruff repair what it can

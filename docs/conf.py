@@ -1,5 +1,6 @@
 """How Sphinx makes a site of these pages: ``make docs``."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -50,13 +51,13 @@ html_show_copyright = False
 
 
 def _write_reference(app: Sphinx) -> None:
-    """Write the generated pages that have changed; Sphinx does not read the others anew."""
+    """Write the generated pages, and leave none of those that were before."""
+    folder = Path(app.srcdir, "reference")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
     changelog = {"reference/changelog": (DOCS.parent / "CHANGELOG.md").read_text("utf-8")}
     for name, text in (conf_reference.pages() | api_reference.pages() | changelog).items():
-        path = Path(app.srcdir, f"{name}.md")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.is_file() or path.read_text("utf-8") != text:
-            path.write_text(text, "utf-8")
+        Path(app.srcdir, f"{name}.md").write_text(text, "utf-8")
 
 
 def _add_navigation(app: Sphinx, name: str, source: list[str]) -> None:

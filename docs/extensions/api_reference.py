@@ -1,9 +1,13 @@
 """Pages on the public modules, from their docstrings, and what Sphinx has to be told of how these are written."""
 
+import inspect
 from itertools import groupby
 from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import stringify_signature
+
+from rcdsac_trl.robot.robot_settings import PAPER
 
 _PAGES = {
     "package": ("The package", ["rcdsac_trl", "rcdsac_trl.errors"]),
@@ -76,11 +80,34 @@ def tables_of_markdown(lines: list[str]) -> list[str]:
     return written
 
 
+def short_signature(thing: Any, signature: str | None) -> str | None:
+    """Return a signature with a class's own parameters, not its metaclass's, and the paper's robot by its name.
+
+    Example:
+        >>> from rcdsac_trl.world.task.env import NavigationEnv
+        >>> short_signature(NavigationEnv, "(*args, **kwargs)").partition(", ")[0]
+        '(world: ~rcdsac_trl.world.task.world_settings.WorldSettings | None = None'
+    """
+    unknown = "(*args, **kwargs)"
+    if inspect.isclass(thing) and signature == unknown:
+        own = inspect.signature(thing.__init__)
+        own = own.replace(parameters=list(own.parameters.values())[1:], return_annotation=own.empty)
+        signature = stringify_signature(own, unqualified_typehints=True).replace(unknown, "")
+    return signature and signature.replace(repr(PAPER), "PAPER")
+
+
 def _adapt(app: Sphinx, what: str, name: str, thing: object, options: Any, lines: list[str]) -> None:
     lines[:] = tables_of_markdown(lines)
+
+
+def _shorten(
+    app: Sphinx, what: str, name: str, thing: object, options: Any, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    return short_signature(thing, signature), returns
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Have Sphinx call what stands above."""
     app.connect("autodoc-process-docstring", _adapt)
+    app.connect("autodoc-process-signature", _shorten)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
