@@ -13,7 +13,7 @@ BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job 
 WORKERS ?= logical
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks clean
+.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks docs clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F '|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -53,6 +53,10 @@ check: setup ## look for mistakes of style and types
 notebooks: setup ## run the notebooks anew, in place
 	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
+docs: setup ## build the documentation as a site: build/docs/html/index.html
+	$(BIN)/python -m sphinx -E -W --keep-going -q -d build/docs/doctrees docs build/docs/html
+	@echo "Open build/docs/html/index.html in a browser."
+
 format: setup ## let ruff repair what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
@@ -66,5 +70,5 @@ $(VENV)/.complete: pyproject.toml constraints.txt
 	$(INSTALL) -e '.[dev]'
 	@touch $@
 
-clean: ## remove .venv and caches
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache
+clean: ## remove .venv, caches and the site
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build/docs docs/reference

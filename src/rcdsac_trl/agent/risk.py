@@ -101,7 +101,7 @@ class RiskMeasure(ABC):
     def inverse_psi(self, u: "Tensor", beta: "Tensor") -> "Tensor":
         r"""Return :math:`g(u) = \psi^{-1}(u)`, the weight of all quantiles at fractions up to ``u``.
 
-        So the value of a sample :math:`x_{(1)} \le \dots \le x_{(n)}` is, exactly,
+        So the value of a sample :math:`x_{(1)} \le \ldots \le x_{(n)}` is, exactly,
         :math:`\sum_i x_{(i)} (g(i/n) - g((i-1)/n))`. It is found by bisection, the largest :math:`\tau` with
         :math:`\psi(\tau) \le u`, so it needs no more than a non-decreasing :meth:`psi`.
 

@@ -25,7 +25,7 @@ STRAIGHT_FACTOR = 1.2
 """r_angular while the desired angular velocity is inside the dead band."""
 MIN_TURN_FACTOR = 0.5
 TURN_SCALE = math.radians(120.0)
-"""The desired angular velocity at which 1 - |omega_u| / scale would reach 0, rad/s, of the paper's robot."""
+"""The desired angular velocity at which 1 - `|omega_u|` / scale would reach 0, rad/s, of the paper's robot."""
 
 RULES_VERSION = 2
 """Version of the rules: results of different versions do not compare.
