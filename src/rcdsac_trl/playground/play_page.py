@@ -393,7 +393,7 @@ class PlayPage:
 
     def _choose(self, **changes: Any) -> None:
         """Open another scene; betas go with who they belong to."""
-        if self._view is None:
+        if self._view is None or None in changes.values():  # a number's field is empty while somebody types
             return
         choice = replace(self._view.choice, stop=self._stop.active, **changes)
         if "agent" in changes:

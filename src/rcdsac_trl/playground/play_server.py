@@ -1,5 +1,6 @@
 """The server: pages on one port, for who may look at them."""
 
+import gc
 import queue
 import socket
 import threading
@@ -99,6 +100,9 @@ class PlayServer:
             browser: open a page.
         """
         self.start()
+        # Bokeh collects garbage as a whole for every page that ends, and all others wait: what is loaded now stays out.
+        gc.collect()
+        gc.freeze()
         if browser:
             webbrowser.open(self.address)
         try:
