@@ -40,3 +40,9 @@ def test_a_film_of_nothing_is_refused_in_a_sentence(tmp_path: Path) -> None:
     until(lambda: "no film" in studio.told(clock)[0])
     assert "film at least one step" in studio.told(clock)[0]
     clock.close(PATIENCE_S)
+
+
+def test_a_film_of_an_earlier_server_stays(tmp_path: Path) -> None:
+    (tmp_path / "play-1.gif").touch()
+    studio = FilmStudio(tmp_path)
+    assert [studio._next_stem().name for _ in range(2)] == ["play-2", "play-3"]

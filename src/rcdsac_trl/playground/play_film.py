@@ -43,6 +43,12 @@ class FilmStudio:
         )
         return self._tell(clock, _FILMING)
 
+    def _next_stem(self) -> Path:
+        """Return what a film is called that is none of an earlier server's."""
+        while any(self._folder.glob(f"{(name := f'play-{next(self._numbers)}')}.*")):
+            pass
+        return self._folder / name
+
     def told(self, clock: DriveClock | None) -> tuple[str, list[str]]:
         """Return a sentence about a drive's latest film, and the names of its files."""
         return ("", []) if clock is None else self._states.get(clock, ("", []))
@@ -59,7 +65,7 @@ class FilmStudio:
         with self._one_at_a_time:
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                stem = self._folder / f"play-{next(self._numbers)}"
+                stem = self._next_stem()
                 named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]
                 files = write_video(film(named, period_s), stem, 1.0 / period_s)
             except (UserInputError, FaultError, OSError) as error:

@@ -26,7 +26,7 @@ from rcdsac_trl.playground.play_page import PlayPage
 
 LOOPBACK = ("localhost", "127.0.0.1")
 # A page that nobody looks at any more ends after this.
-_UNUSED_MS = 6000
+_UNUSED_MS = 15_000
 _CHECK_UNUSED_MS = 1000
 _LARGEST_MESSAGE_BYTES = 1_000_000
 
