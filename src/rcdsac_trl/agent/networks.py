@@ -24,7 +24,15 @@ from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import LOG_STD_RANGE as LOG_STD_RANGE
-from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, HAT_OFFSETS, HAT_SLOPES, NUM_LOOK_AHEAD
+from rcdsac_trl.robot.look_ahead import (
+    FORESEEN_SIZE,
+    HAT_OFFSETS,
+    HAT_SLOPES,
+    NUM_LOOK_AHEAD,
+    foreseen_among,
+    read_by_heads,
+    told_of_action,
+)
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, RangeCode
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
@@ -148,7 +156,7 @@ class Encoder(HistoryEncoder):
             if "remembered" not in vectors:
                 raise UserInputError("network.look_ahead=true reads what is remembered: set sensor.memory_s above 0")
             self.foreseen_in = list(vectors).index("remembered")
-            self.foreseen_from = sum(list(vectors.values())[: self.foreseen_in + 1]) - FORESEEN_SIZE
+            self.foreseen_from = foreseen_among(vectors).start
         self.range = RangeFeatures(network.conv, network.range, network.padding, network.range_code)
         self.vectors = nn.ModuleList(nn.Linear(size, network.vector) for size in vectors.values())
         self.gru = nn.GRU(network.range + network.vector * len(vectors), network.memory, batch_first=True)
@@ -157,7 +165,7 @@ class Encoder(HistoryEncoder):
     @classmethod
     def memory_size_of(cls, network: NetworkSettings) -> int:
         """Return how many numbers the heads read."""
-        return network.memory + (FORESEEN_SIZE if network.look_ahead else 0)
+        return read_by_heads(network.memory, network.look_ahead)
 
     def forward(self, range_: Tensor, *vectors: Tensor) -> Tensor:
         """Run whole sequences ``[B, T, ...]`` from a zero state; returns the memory ``[B, T, memory]``.
@@ -345,7 +353,7 @@ class QuantileHead(nn.Module):
         super().__init__()
         self.measure = measure
         self.look_ahead = LookAhead() if network.look_ahead else None
-        self.input = nn.Linear(network.memory + _told_of_action(action_size, network), network.head)
+        self.input = nn.Linear(network.memory + told_of_action(action_size, network.look_ahead), network.head)
         self.cosines = CosineFeatures(network.cosines)
         self.gate_tau = nn.Linear(network.cosines, network.head)
         if measure is not None:
@@ -398,7 +406,7 @@ class ScalarHead(nn.Module):
         """Build the layers."""
         super().__init__()
         self.look_ahead = LookAhead() if network.look_ahead else None
-        self.input = nn.Linear(network.memory + _told_of_action(action_size, network), network.head)
+        self.input = nn.Linear(network.memory + told_of_action(action_size, network.look_ahead), network.head)
         self.hidden = nn.Linear(network.head, network.head)
         self.output = nn.Linear(network.head, 1)
 
@@ -412,7 +420,3 @@ class ScalarHead(nn.Module):
 def with_look_ahead(look_ahead: LookAhead | None, memory: Tensor, action: Tensor) -> Tensor:
     """Return what a critic is told of an action: the action ``[.., 2]``, and what is foreseen of it."""
     return action if look_ahead is None else torch.cat((action, look_ahead(memory, action)), dim=-1)
-
-
-def _told_of_action(action_size: int, network: NetworkSettings) -> int:
-    return action_size + (NUM_LOOK_AHEAD if network.look_ahead else 0)

@@ -1,10 +1,12 @@
 """Environments by the names of ``conf/``, for who uses them from Python."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rcdsac_trl.config.compose import choices, compose
-from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.config.run_config import plain, training_settings
+from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
@@ -14,6 +16,13 @@ from rcdsac_trl.world.task.world_settings import WorldSettings
 
 # Of these map sets a path says which maps they are.
 _OF_FILES = ("file", "barn")
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """What a map set is read as: whichever kind of source it is."""
+
+    map: MapSource
 
 
 def named_world(**options: Any) -> WorldSettings:
@@ -44,12 +53,23 @@ def _resolved(options: dict[str, Any]) -> dict[str, Any]:
     return resolved
 
 
+def generated_sets() -> list[str]:
+    """List the map sets of ``conf/map`` whose maps are drawn, not read from files."""
+    return [name for name in choices("map") if name not in _OF_FILES]
+
+
+def map_set(name: str) -> MapSource:
+    """Return what the maps of a set of ``conf/map`` are drawn from."""
+    section = plain(compose("draw_maps", [f"map={name}"]))["map"]  # a root that has little else
+    return read(_Maps, {"map": section}).map
+
+
 def _maps(named: str | Path | MapSource) -> MapSource:
     if not isinstance(named, str | Path):
         return named
-    generated = [name for name in choices("map") if name not in _OF_FILES]
+    generated = generated_sets()
     if str(named) in generated:
-        return training_settings(_composed(f"map={named}")).map
+        return map_set(str(named))
     if Path(named).exists():
         return FileMapSettings(path=str(named))
     raise UserInputError(

@@ -11,8 +11,6 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.scene_choice import shortened
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
-from rcdsac_trl.world.maps.generator import MapSettings
-from rcdsac_trl.world.maps.map_mixture import MapMixture
 from rcdsac_trl.world.maps.map_source import MapSource, check_maps, with_digests
 from rcdsac_trl.world.task.rules import TaskSettings
 
@@ -36,7 +34,7 @@ class Offers:
 
     @classmethod
     def of(
-        cls, runs: Sequence[str], map_sets: Mapping[str, MapSettings | MapMixture], files: Mapping[str, FileMapSettings]
+        cls, runs: Sequence[str], map_sets: Mapping[str, MapSource], files: Mapping[str, FileMapSettings]
     ) -> "Offers":
         """Collect what there is.
 

@@ -5,18 +5,13 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.config.named_world import generated_sets, map_set
 from rcdsac_trl.config.play_settings import PlaySettings
-from rcdsac_trl.config.run_config import plain, read_config
-from rcdsac_trl.config.typed import read
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.play_server import LOOPBACK, PlayServer, what_it_means
 from rcdsac_trl.system.progress import serving
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
-from rcdsac_trl.world.maps.generator import MapSettings
-from rcdsac_trl.world.maps.map_mixture import MapMixture
-
-_OF_FILES = ("file", "barn")
 
 
 @dataclass(frozen=True)
@@ -49,8 +44,8 @@ def make_session(cfg: DictConfig) -> PlaySession:
 
 def offers_of(settings: PlaySettings) -> Offers:
     """Return agents and maps that settings name, with the map sets of ``conf/map/``."""
-    sets = {name: _map_settings(name) for name in choices("map") if name not in _OF_FILES}
-    files = {Path(path).stem: _file_settings(path) for path in settings.maps}
+    sets = {name: map_set(name) for name in generated_sets()}
+    files = {Path(path).stem: FileMapSettings(path=path) for path in settings.maps}
     return Offers.of(settings.runs, dict(sorted(sets.items(), key=lambda item: item[0] != "mixed")), files)
 
 
@@ -64,13 +59,3 @@ def serve(offers: Offers, settings: PlaySettings) -> PlayServer:
         max_sessions=settings.max_sessions,
         films=Path(settings.films),
     )
-
-
-def _map_settings(name: str) -> MapSettings | MapMixture:
-    values = plain(compose("draw_maps", [f"map={name}"]))["map"]
-    return read(MapMixture, values, "map") if "families" in values else read(MapSettings, values, "map")
-
-
-def _file_settings(path: str) -> FileMapSettings:
-    values = plain(compose("draw_maps", ["map=file"]))["map"]
-    return read(FileMapSettings, values | {"path": path}, "map")

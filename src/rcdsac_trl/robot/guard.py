@@ -182,11 +182,13 @@ class Guard:
         creep = min(v, _CREEP_M_PER_S)
         turns = self.max_turn_rad_per_s * _TURNS
         turns = turns[np.argsort(np.abs(turns - omega), kind="stable")].tolist()
-        shares = [self._fastest(creep, turn, sectors, moving) for turn in turns]
-        if (share := next((share for share in shares if share >= _WORTH_IT), 0.0)) > 0.0:
-            return share * creep, turns[shares.index(share)]
-        if (turn := self._turn_to_a_way(creep, omega, sectors)) is not None:
-            return 0.0, turn
+        shares: list[float] = []
+        for turn in turns:
+            shares.append(self._fastest(creep, turn, sectors, moving))
+            if shares[-1] >= _WORTH_IT:
+                return shares[-1] * creep, turn
+        if (towards := self._turn_to_a_way(creep, omega, sectors)) is not None:
+            return 0.0, towards
         share = max(shares)
         return share * creep, omega if share == 0.0 else turns[shares.index(share)]
 

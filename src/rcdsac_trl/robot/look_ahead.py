@@ -5,6 +5,7 @@ which way there is more room. Between the actions of :data:`FORESEEN_ACTIONS` it
 turns of a row, then from row to row.
 """
 
+from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -26,6 +27,30 @@ NUM_LOOK_AHEAD = 2
 
 FORESEEN_SIZE = NUM_LOOK_AHEAD * NUM_FORESEEN_COMMANDS
 """Numbers they are interpolated from: the last of what is remembered."""
+
+
+def foreseen_among(vectors: Mapping[str, int]) -> slice:
+    """Return where the foreseen clearances stand in all vector observations, one behind the other.
+
+    Args:
+        vectors: name and size of each, in their order; what is remembered is one of them.
+
+    Example:
+        >>> foreseen_among({"waypoint": 6, "velocity": 4, "remembered": 90, "collision_weight": 1})
+        slice(56, 100, None)
+    """
+    end = sum(list(vectors.values())[: list(vectors).index("remembered") + 1])
+    return slice(end - FORESEEN_SIZE, end)
+
+
+def read_by_heads(memory: int, look_ahead: bool) -> int:
+    """Return how many numbers of an encoder's a head reads: the memory, and with a look ahead what is foreseen."""
+    return memory + (FORESEEN_SIZE if look_ahead else 0)
+
+
+def told_of_action(action_size: int, look_ahead: bool) -> int:
+    """Return how many numbers a critic is told of an action: its own, and with a look ahead how near it leads."""
+    return action_size + (NUM_LOOK_AHEAD if look_ahead else 0)
 
 
 def _lines(grid: tuple[float, ...]) -> list[tuple[tuple[float, float], tuple[float, float]]]:

@@ -129,8 +129,7 @@ def diagnose(
     """
     step = len(poses) - 1
     time_s = step * period_s + touch.motor_step * robot.motor_period_s
-    x, y, yaw = touch.pose
-    bearing = math.remainder(math.atan2(touch.y - y, touch.x - x) - yaw, 2.0 * math.pi)
+    told = touch_columns(touch)
     discs = _discs(movers, [mover.radius for mover in map_.movers])
     if touch.mover is None:
         piece = _nearest(map_, touch.x, touch.y)
@@ -142,13 +141,23 @@ def diagnose(
         velocity = (movers[step, touch.mover] - movers[max(step - 1, 0), touch.mover]) / period_s
         segments, hit_discs = np.empty((0, 4)), discs[:, [touch.mover]]
     sensed = _last_sensed(segments, hit_discs, map_, discs, mask, poses, robot.lidar.max_range_m)
-    return {
+    row = told | {
         "step": step,
         "time_s": time_s,
         "thing": thing,
-        "bearing_rad": bearing,
-        "bearing_sensed": int(mask[math.floor(bearing / BIN_RAD) % NUM_BINS]),
+        "bearing_sensed": int(mask[math.floor(told["bearing_rad"] / BIN_RAD) % NUM_BINS]),
         "unsensed_s": math.nan if sensed is None else time_s - sensed * period_s,
+        "thing_vx_m_per_s": float(velocity[0]),
+        "thing_vy_m_per_s": float(velocity[1]),
+    }
+    return {name: row[name] for name in COLLISION_COLUMNS}
+
+
+def touch_columns(touch: Touch) -> dict[str, float]:
+    """Return what is said of a collision wherever it was: the bearing, the place, the robot's pose and velocities."""
+    x, y, yaw = touch.pose
+    return {
+        "bearing_rad": math.remainder(math.atan2(touch.y - y, touch.x - x) - yaw, 2.0 * math.pi),
         "x_m": touch.x,
         "y_m": touch.y,
         "robot_x_m": x,
@@ -156,8 +165,6 @@ def diagnose(
         "robot_yaw_rad": yaw,
         "robot_v_m_per_s": touch.v,
         "robot_omega_rad_per_s": touch.omega,
-        "thing_vx_m_per_s": float(velocity[0]),
-        "thing_vy_m_per_s": float(velocity[1]),
     }
 
 

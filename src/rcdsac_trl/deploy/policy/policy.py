@@ -460,7 +460,8 @@ class Policy:
         (v, omega), reason, been = self._wanted, None, None
         told = None
         if self._advice is not None:
-            sectors = replace(sectors, distances_m=self._advice.distances_m if fresh else sectors.distances_m)
+            if fresh:
+                sectors = replace(sectors, distances_m=self._advice.distances_m)
             been = self._advice.been
             if self._advice.instead is not None:
                 v, omega = self._advice.instead

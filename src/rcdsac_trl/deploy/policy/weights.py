@@ -23,7 +23,7 @@ from safetensors.numpy import save as save_tensors
 
 from rcdsac_trl.deploy.policy.driving_record import DrivingRecord, driving_record
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, NUM_LOOK_AHEAD
+from rcdsac_trl.robot.look_ahead import foreseen_among, read_by_heads, told_of_action
 from rcdsac_trl.robot.observation import RangeCode, vector_observations
 from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS, check_memory
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
@@ -169,8 +169,7 @@ class AgentConfig:
         """Where in all vector observations the foreseen clearances stand that its heads read; None: they do not."""
         if not self.look_ahead:
             return None
-        end = sum(vector_observations(self.memory_s).values())
-        return slice(end - FORESEEN_SIZE, end)
+        return foreseen_among(self.vectors)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of every tensor of the agent, by name."""
@@ -197,7 +196,7 @@ class AgentConfig:
 
     def _read(self) -> int:
         """Return how many numbers of the encoder's a head reads."""
-        return self.network["memory"] + (FORESEEN_SIZE if self.look_ahead else 0)
+        return read_by_heads(self.network["memory"], self.look_ahead)
 
     def _actor_head(self) -> dict[str, tuple[int, ...]]:
         n = self.network
@@ -211,7 +210,7 @@ class AgentConfig:
 
     def _critic_head(self) -> dict[str, tuple[int, ...]]:
         n = self.network
-        told = _ACTION_SIZE + (NUM_LOOK_AHEAD if self.look_ahead else 0)
+        told = told_of_action(_ACTION_SIZE, self.look_ahead)
         shapes = _linear("input", self._read() + told, n["head"])
         if self.critic == "quantile":
             shapes |= _linear("gate_tau", n["cosines"], n["head"])

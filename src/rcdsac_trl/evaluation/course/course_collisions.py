@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rcdsac_trl.config.course_settings import PERIOD_S
 from rcdsac_trl.evaluation.course.course_drive import Trace, is_own
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
+from rcdsac_trl.rollout.collisions import PART_M, touch_columns
 from rcdsac_trl.world.maps.geometry import segment_clearance
 from rcdsac_trl.world.maps.shapes import solid_arrays
 from rcdsac_trl.world.office.building import Office
@@ -34,8 +35,6 @@ COLLISION_COLUMNS = (
 
 # What is this near to where a sector says that something is was seen: a sector's half width at 2.5 m, and noise.
 _SEEN_M = 0.1
-# Of a wall, what lies within this of the place that was hit must have been seen.
-_PART_M = 0.5
 _MIDDLES = (np.arange(NUM_BINS) + 0.5) * BIN_RAD
 
 
@@ -51,22 +50,13 @@ def collisions_of(office: Office, trace: Trace) -> pd.DataFrame:
 
 
 def _row(office: Office, trace: Trace, step: int, touch: Touch) -> dict[str, Any]:
-    x, y, yaw = touch.pose
     piece = _nearest(office, touch) if touch.mover is None else None
     seen = _last_seen(office, trace, step, touch, piece)
-    return {
+    return touch_columns(touch) | {
         "time_s": step * PERIOD_S,
         "thing": "person" if piece is None else piece.name,
         "own": int(is_own(touch)),
-        "bearing_rad": math.remainder(math.atan2(touch.y - y, touch.x - x) - yaw, 2.0 * math.pi),
         "unseen_s": math.nan if seen is None else (step - 1 - seen) * PERIOD_S,
-        "x_m": touch.x,
-        "y_m": touch.y,
-        "robot_x_m": x,
-        "robot_y_m": y,
-        "robot_yaw_rad": yaw,
-        "robot_v_m_per_s": touch.v,
-        "robot_omega_rad_per_s": touch.omega,
     }
 
 
@@ -89,7 +79,7 @@ def _last_seen(office: Office, trace: Trace, step: int, touch: Touch, piece: Pie
             gaps = np.hypot(*(points - trace.people[moment, touch.mover]).T) - radius_m
             seen = bool((np.abs(gaps) < _SEEN_M).any())
         else:
-            near = points[np.hypot(*(points - (touch.x, touch.y)).T) < _PART_M]
+            near = points[np.hypot(*(points - (touch.x, touch.y)).T) < PART_M]
             seen = any(_gap_m(piece, x, y) < _SEEN_M for x, y in near.tolist())
         if seen:
             return moment

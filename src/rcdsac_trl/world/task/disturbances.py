@@ -76,17 +76,19 @@ class PoseError:
     def __init__(self, std: tuple[float, float], rng: np.random.Generator) -> None:
         self._std = np.array([std[0], std[0], std[1]])
         self._rng = rng
-        self._off = self._drawn() if self._std.any() else np.zeros(3)
+        # Asked in every step: a plain truth, where a call of NumPy would cost more than the rest.
+        self._is_off = any(std)
+        self._off = self._drawn() if self._is_off else np.zeros(3)
 
     def step(self, elapsed_s: float) -> None:
         """Let time pass."""
-        if self._std.any():
+        if self._is_off:
             kept = math.exp(-elapsed_s / POSE_ERROR_S)
             self._off = kept * self._off + math.sqrt(1.0 - kept * kept) * self._drawn()
 
     def added_to(self, pose: Pose) -> Pose:
         """Return where the robot believes to be, m and rad."""
-        if not self._std.any():
+        if not self._is_off:
             return pose
         x, y, yaw = self._off.tolist()
         return pose[0] + x, pose[1] + y, pose[2] + yaw
