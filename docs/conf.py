@@ -16,9 +16,40 @@ import conf_reference  # noqa: E402
 
 # Every page of the site, part by part. It stands here, not in index.md, so that the pages stay plain Markdown.
 NAVIGATION = {
-    "Tutorials": ["play", "running", "your-building", "your-robot"],
-    "How-to guides": ["robot", "nav2", "scaling-out", "planners"],
-    "Reference": ["reference/commands", "reference/configuration", *api_reference.PAGES, "reference/changelog"],
+    "Tutorials": [
+        "tutorials/drive",
+        "tutorials/train",
+        "tutorials/own-map",
+        "tutorials/own-robot",
+        "tutorials/own-measure",
+    ],
+    "How-to: train and measure": [
+        "running",
+        "continue",
+        "evaluate",
+        "report",
+        "calibrate",
+        "planners",
+        "scaling-out",
+        "python",
+    ],
+    "How-to: drive": [
+        "play",
+        "robot",
+        "ros",
+        "nav2",
+        "replay",
+        "office-course",
+        "your-building",
+        "your-robot",
+    ],
+    "Reference": [
+        "run-folder",
+        "reference/commands",
+        "reference/configuration",
+        *api_reference.PAGES,
+        "reference/changelog",
+    ],
     "Explanation": ["agent", "world", "differences", "results", "study", "off-the-maps", "speed"],
 }
 

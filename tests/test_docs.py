@@ -7,11 +7,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import pytest
 from omegaconf import OmegaConf
 
 from rcdsac_trl import draw_maps
+from rcdsac_trl.agent.risk import MEASURES
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.verbs import VERBS
@@ -21,20 +24,41 @@ from rcdsac_trl.training.setup import check_training
 from tiny import first_combinations_only
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")])
+DOCS = ROOT / "docs"
+# Those of docs/reference are made by `make docs`.
+PAGES = (path for path in DOCS.rglob("*.md") if DOCS / "reference" not in path.parents)
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES])
+# How a command begins, its verb first.
+COMMAND = r"(?:python -m rcdsac_trl\.|rcdsac-trl )"
+# The files that pages have their reader write, with their text: their commands name them.
+WRITTEN = r"^Save this as `([^`]+)`:\n\n```\w+\n(.*?)^```"
 # The file that CONTRIBUTING.md has its reader write.
 NEW_ROW = "rcdsac_wang"
 
 
-def texts(pattern: str) -> list[tuple[str, str]]:
-    """Return document and text of everything the pattern finds."""
-    return [(path.name, found) for path in DOCUMENTS for found in re.findall(pattern, path.read_text(), re.M | re.S)]
+def texts(pattern: str) -> list[tuple[str, Any]]:
+    """Return document and text, or texts, of everything the pattern finds."""
+    return [
+        (path.relative_to(ROOT).as_posix(), found)
+        for path in DOCUMENTS
+        for found in re.findall(pattern, path.read_text(), re.M | re.S)
+    ]
+
+
+def write_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the folder the current one, with the files in it that a reader has by then."""
+    monkeypatch.chdir(folder)
+    for _, (path, text) in texts(WRITTEN):
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).write_text(text)
 
 
 @pytest.mark.parametrize(("name", "code"), texts(r"^```python\n(.*?)^```"))
 def test_python_runs(name: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    exec(compile(code, name, "exec"), {"__name__": "__main__"})
+    write_files(tmp_path, monkeypatch)
+    monkeypatch.syspath_prepend(tmp_path)
+    with mock.patch.dict(MEASURES):  # a measure that an example registers is its own
+        exec(compile(code, name, "exec"), {"__name__": "__main__"})
 
 
 def test_the_reward_term_of_contributing_needs_one_file(tmp_path: Path) -> None:
@@ -72,12 +96,13 @@ def test_the_reward_term_of_contributing_needs_one_file(tmp_path: Path) -> None:
 
 def commands() -> list[tuple[str, str]]:
     """Return verb and overrides of every command that names no folder of the reader's."""
-    found = {text.split("#")[0].strip() for _, text in texts(r"python -m rcdsac_trl\.([^\n`]+)") if "<" not in text}
+    found = {text.split("#")[0].strip() for _, text in texts(rf"{COMMAND}(\w[^\n`]+)") if "<" not in text}
     return sorted((verb, rest) for verb, _, rest in (text.partition(" ") for text in found) if rest)
 
 
 @pytest.mark.parametrize(("verb", "arguments"), commands())
-def test_commands_are_accepted(verb: str, arguments: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_are_accepted(verb: str, arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_files(tmp_path, monkeypatch)
     overrides = shlex.split(arguments)
     if verb == "search":
         make_search(overrides)
@@ -95,14 +120,13 @@ def test_commands_are_accepted(verb: str, arguments: str, monkeypatch: pytest.Mo
 
 
 def test_there_are_commands_of_every_verb() -> None:
-    verbs = {text.split()[0] for _, text in texts(r"python -m rcdsac_trl\.(\w+ [^\n`]+)")}
+    verbs = {text.split()[0] for _, text in texts(rf"{COMMAND}(\w+ [^\n`]+)")}
     assert verbs == set(VERBS)
 
 
 @pytest.mark.parametrize(("name", "target"), texts(r"\]\((?!https?:)([^)#]+)"))
 def test_links_lead_somewhere(name: str, target: str) -> None:
-    folder = next(path.parent for path in DOCUMENTS if path.name == name)
-    assert (folder / target).is_file()
+    assert ((ROOT / name).parent / target).is_file()
 
 
 def test_named_files_exist() -> None:
@@ -127,7 +151,7 @@ def test_named_keys_exist() -> None:
 
 
 def test_every_row_and_choice_is_named() -> None:
-    running = (ROOT / "docs" / "running.md").read_text()
+    running = (DOCS / "running.md").read_text()
     for group in (
         "algo",
         "algo/distortion",

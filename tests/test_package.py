@@ -52,7 +52,7 @@ def test_extras_that_are_named_exist() -> None:
         *(ROOT / "src").rglob("*.py"),
         *(ROOT / "conf").rglob("*.yaml"),
         *ROOT.glob("*.md"),
-        *ROOT.glob("docs/*.md"),
+        *ROOT.glob("docs/**/*.md"),
     ]
     named = {name for path in files for name in re.findall(r"rcdsac-trl\[(\w+)\]", path.read_text())}
     assert named

@@ -33,7 +33,8 @@ def test_the_navigation_names_every_page_once(configuration: dict[str, Any]) -> 
     generated = configuration["conf_reference"].pages() | configuration["api_reference"].pages()
     # Those of the groups are listed by the page on the configuration.
     listed = re.findall(r"^conf-.*$", generated["reference/configuration"], re.M)
-    written = [path.stem for path in DOCS.glob("*.md") if path.stem != "index"]
+    written = {path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.rglob("*.md")}
+    written = {name for name in written if name != "index" and not name.startswith("reference/")}
     assert sorted([*named, *(f"reference/{name}" for name in listed)]) == sorted(
         [*written, *generated, "reference/changelog"]
     )
