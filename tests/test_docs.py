@@ -124,9 +124,18 @@ def test_there_are_commands_of_every_verb() -> None:
     assert verbs == set(VERBS)
 
 
-@pytest.mark.parametrize(("name", "target"), texts(r"\]\((?!https?:)([^)#]+)"))
-def test_links_lead_somewhere(name: str, target: str) -> None:
-    assert ((ROOT / name).parent / target).is_file()
+def anchors(page: Path) -> set[str]:
+    """Return the names that GitHub gives a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.M)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize(("name", "link"), texts(r"\]\((?!https?:)([^)]+)\)"))
+def test_links_lead_somewhere(name: str, link: str) -> None:
+    target, _, anchor = link.partition("#")
+    page = (ROOT / name).parent / target if target else ROOT / name
+    assert page.is_file()
+    assert not anchor or anchor in anchors(page)
 
 
 def test_named_files_exist() -> None:
