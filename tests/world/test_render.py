@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from rcdsac_trl.colors import LIGHT, rgb
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import sensor_mask
-from rcdsac_trl.world import render
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.task.env import NavigationEnv
@@ -27,24 +27,24 @@ def test_everything_is_drawn_in_its_place_and_colour() -> None:
     assert frame.shape == (SIZE_PX, SIZE_PX, 3)
     assert frame.dtype == np.uint8
     for point, color in {
-        (8.0, 15.0): render.WALL,
-        (5.0, 5.0): render.MAPPED,
-        (16.0, 5.0): render.UNMAPPED,
-        (17.0, 12.0): render.UNMAPPED,
-        (2.0, 17.0): render.MOVER,
-        (3.0, 2.0): render.GOAL,
-        (13.5, 17.5): render.FLOOR,
-        (10.0, 8.14): render.ROBOT,
+        (8.0, 15.0): LIGHT.wall,
+        (5.0, 5.0): LIGHT.mapped,
+        (16.0, 5.0): LIGHT.unmapped,
+        (17.0, 12.0): LIGHT.unmapped,
+        (2.0, 17.0): LIGHT.mover,
+        (3.0, 2.0): LIGHT.goal,
+        (13.5, 17.5): LIGHT.floor,
+        (10.0, 8.14): LIGHT.robot,
     }.items():
-        assert at(frame, *point) == pytest.approx(np.array(color), abs=3), point
+        assert at(frame, *point) == pytest.approx(np.array(rgb(color)), abs=3), point
     # The upper left corner of the picture lies outside the map.
-    assert frame[1, 1] == pytest.approx(np.array(render.OUTSIDE), abs=3)
+    assert frame[1, 1] == pytest.approx(np.array(rgb(LIGHT.outside)), abs=3)
 
 
 def test_the_view_of_the_sensor_is_tinted_and_nothing_else() -> None:
     frame = Renderer(SIZE_PX).draw(scene(trail=[]))
     ahead, behind = at(frame, 11.5, 8.5), at(frame, 8.5, 8.5)
-    assert behind == pytest.approx(np.array(render.FLOOR), abs=3)
+    assert behind == pytest.approx(np.array(rgb(LIGHT.floor)), abs=3)
     assert ahead[2] - ahead[0] > 15  # bluish
     everywhere = Renderer(SIZE_PX).draw(scene(trail=[], sensor_mask=sensor_mask("full")))
     assert at(everywhere, 8.5, 8.5) == pytest.approx(ahead, abs=3)
@@ -54,7 +54,7 @@ def test_contact_trail_and_caption_change_the_picture() -> None:
     renderer = Renderer(SIZE_PX)
     plain = renderer.draw(scene())
     touching = renderer.draw(scene(in_contact=True))
-    assert at(touching, 10.0, 8.14) == pytest.approx(np.array(render.TOUCHING), abs=3)
+    assert at(touching, 10.0, 8.14) == pytest.approx(np.array(rgb(LIGHT.touching)), abs=3)
     untrailed = renderer.draw(scene(trail=[]))
     assert np.abs(at(plain, 9.0, 8.0) - at(untrailed, 9.0, 8.0)).max() > 50
     captioned = renderer.draw(scene(), "β = −1.0")
@@ -77,11 +77,11 @@ def test_a_close_view_follows_the_robot() -> None:
     for pose in ((10.0, 8.0, 0.3), (3.1, 17.2, 0.3), (0.4, 19.6, 0.3)):
         frame = renderer.draw(scene(pose=pose, trail=[]))
         assert frame.shape == (200, 200, 3)
-        # White arrow in the middle, robot's green around it: 50 px/m.
+        # White arrow in the middle, robot's blue around it: 50 px/m.
         assert frame[100, 100] == pytest.approx(np.full(3, 255), abs=3)
-        assert frame[100, 91] == pytest.approx(np.array(render.ROBOT), abs=40)
+        assert frame[100, 91] == pytest.approx(np.array(rgb(LIGHT.robot)), abs=40)
     # The last pose is in the map's corner, so the picture's corner lies outside.
-    assert frame[2, 2] == pytest.approx(np.array(render.OUTSIDE), abs=3)
+    assert frame[2, 2] == pytest.approx(np.array(rgb(LIGHT.outside)), abs=3)
 
 
 def test_edges_are_smooth() -> None:
