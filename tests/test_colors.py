@@ -2,6 +2,7 @@
 
 import ast
 import itertools
+import json
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -120,6 +121,8 @@ def test_captions_are_of_colours() -> None:
 
 
 # ------------------------------------------------------------------------------------------------ one place
+ROOT = Path(__file__).parents[1]
+PROGRAMS = (ROOT / "docs" / "images", ROOT / "benchmarks")
 SOURCES = sorted(path for path in SOURCE.rglob("*") if path.suffix in (".py", ".css", ".html", ".js"))
 HEXADECIMAL = re.compile(r"#(?:[0-9a-fA-F]{3,4}){1,2}\b|\brgba?\(|\bhsla?\(")
 # Names of colours and of colour maps; of the one letter that Matplotlib takes, none is told from text.
@@ -143,8 +146,8 @@ def spelled_in_python(text: str) -> list[int]:
                 lines.append(node.lineno)
         elif isinstance(node, ast.Tuple) and len(node.elts) in (3, 4):
             parts = [part.value for part in node.elts if isinstance(part, ast.Constant) and type(part.value) is int]
-            # As bytes: what counts things is smaller.
-            if len(parts) == len(node.elts) and max(parts) <= 255 and sum(parts) > 48:
+            # As bytes: what counts things is smaller, and as an alpha it would show nothing.
+            if len(parts) == len(node.elts) and max(parts) <= 255 and sum(parts) > 96 and (parts[3:] or [255])[0] > 15:
                 lines.append(node.lineno)
     return lines
 
@@ -173,3 +176,13 @@ def test_no_other_module_spells_a_colour() -> None:
     }
     assert spelled.pop("colors.py")
     assert not spelled
+
+
+def test_nor_does_a_program_or_a_notebook() -> None:
+    texts = {path.name: path.read_text("utf-8") for folder in PROGRAMS for path in folder.glob("*.py")}
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        cells = [cell["source"] for cell in json.loads(path.read_text("utf-8"))["cells"] if cell["cell_type"] == "code"]
+        # IPython's own commands are not Python.
+        texts[path.name] = "\n".join(re.sub(r"^%.*", "", "".join(cell), flags=re.M) for cell in cells)
+    assert len(texts) > 10
+    assert not {name: lines for name, text in texts.items() if (lines := spelled_in_python(text))}

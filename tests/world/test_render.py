@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rcdsac_trl.colors import LIGHT, rgb
+from rcdsac_trl.colors import CAPTIONS, LIGHT, rgb
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.world.canvas import scale_bar_m
+from rcdsac_trl.world.legend import legend
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.task.env import NavigationEnv
@@ -98,6 +100,50 @@ def test_the_environment_draws_its_agents() -> None:
     assert frames[0].shape == (512, 512, 3)
     assert not np.array_equal(frames[0], frames[1])
     env.close()
+
+
+def inked(frame: np.ndarray) -> np.ndarray:
+    """Return the columns of the lower edge in which a scale bar is."""
+    return np.flatnonzero((frame[-frame.shape[0] // 24 :] == rgb(LIGHT.ink)).all(-1).any(0))
+
+
+@pytest.mark.parametrize(("view_m", "bar_m"), [(4.0, 1.0), (8.0, 2.0), (None, 5.0)])
+def test_the_scale_bar_is_as_long_as_it_says(view_m: float | None, bar_m: float) -> None:
+    frame = Renderer(SIZE_PX, view_m).draw(scene())
+    columns = inked(frame)
+    shown_m = view_m or 1.04 * SIZE_M
+    assert scale_bar_m(shown_m) == bar_m
+    assert columns[-1] - columns[0] == pytest.approx(bar_m * SIZE_PX / shown_m, abs=2)
+    assert np.diff(columns).max() == 1
+    way = Renderer(SIZE_PX, view_m).draw_way(MAP, [(10.0, 8.0), (11.0, 8.0)], [], [])
+    assert np.array_equal(inked(way), columns)
+
+
+def test_the_end_of_the_ring_of_sectors_is_seen_without_a_seam() -> None:
+    mask = sensor_mask("narrow")
+    assert mask[[0, -1]].all()
+    frame = Renderer(SIZE_PX, view_m=8.0).draw(scene(sensor_mask=mask, distances_m=np.full(180, 2.0), trail=[]))
+    *_, yaw = scene().pose
+    across = [
+        frame[int(SIZE_PX / 2 - 52 * np.sin(yaw + turn)), int(SIZE_PX / 2 + 52 * np.cos(yaw + turn))].astype(int)
+        for turn in np.radians(np.arange(-8.0, 8.5, 0.5))
+    ]
+    assert np.ptp(across, axis=0).max() <= 12
+
+
+def test_a_legend_fits_its_picture() -> None:
+    captions = {name: CAPTIONS[name] for name in ("robot", "seen", "trail", "wall", "mapped", "unmapped")}
+    wide, narrow = legend(captions, 1200, 16.0), legend(captions, 320, 16.0)
+    assert (wide.width, narrow.width) == (1200, 320)
+    assert 2 * wide.height < narrow.height < 6 * wide.height
+    for picture in (wide, narrow):
+        pixels = np.asarray(picture).astype(int)
+        drawn = np.argwhere((pixels != rgb(LIGHT.card)).any(-1))
+        # Nothing touches an edge, and every colour is there.
+        assert drawn.min() >= 2
+        assert (np.array(pixels.shape[:2]) - drawn.max(axis=0)).min() >= 2
+        for name in ("robot", "trail", "wall", "mapped", "unmapped"):
+            assert (np.abs(pixels - rgb(getattr(LIGHT, name))).max(-1) <= 3).any(), name
 
 
 @pytest.mark.parametrize("wrong", [{"size_px": 4}, {"view_m": 0.0}, {"oversampling": 0}])
