@@ -6,7 +6,7 @@ from PIL import Image, ImageDraw
 
 from rcdsac_trl.colors import LIGHT, mixed
 from rcdsac_trl.world.canvas import font
-from rcdsac_trl.world.render import SEEN_OPACITY
+from rcdsac_trl.world.render import GOAL_OPACITY, SEEN_OPACITY
 
 _LINES = ("way", "trail", "hit")
 _AREAS = ("wall", "mapped", "unmapped", "seen")
@@ -71,5 +71,7 @@ def _draw_key(draw: ImageDraw.ImageDraw, name: str, box: tuple[float, float, flo
     elif name in _AREAS:
         # What is seen is drawn translucent.
         draw.rectangle(box, mixed(LIGHT.floor, color, SEEN_OPACITY) if name == "seen" else color)
+    elif name == "goal":
+        draw.ellipse(box, mixed(LIGHT.floor, color, GOAL_OPACITY), color, thick)
     else:
         draw.ellipse(box, color)

@@ -20,6 +20,8 @@ from rcdsac_trl.world.maps.shapes import Map
 
 SEEN_OPACITY = 0.2
 """Of what the sensor sees: the floor and what stands there show through."""
+GOAL_OPACITY = 0.24
+"""Of the inside of a goal's ring."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +88,14 @@ class Renderer:
 
         Args:
             scene: what to draw.
-            caption: a line of text at the lower left.
+            caption: a line of text at the upper left; the scale bar is at the lower right.
 
         Returns:
             uint8 RGB, shape [size_px, size_px, 3].
         """
         canvas = self._canvas(scene.map, scene.pose)
         _draw_lidar(canvas, scene)
-        _draw_trail(canvas, scene.trail)
+        _draw_trail(canvas, scene.trail, 0.07)
         _draw_path(canvas, scene)
         for x, y, radius in scene.movers:
             canvas.disc(x, y, radius, LIGHT.mover, LIGHT.mover_edge, 0.04)
@@ -126,9 +128,9 @@ class Renderer:
             uint8 RGB, shape [size_px, size_px, 3].
         """
         canvas = self._canvas(map_, way[-1])
-        _draw_trail(canvas, way)
+        _draw_trail(canvas, way, 0.12)
         for number, (x, y) in enumerate(goals, start=1):
-            canvas.disc(x, y, 0.42, mixed(LIGHT.floor, LIGHT.goal, 0.24), LIGHT.goal, 0.06)
+            canvas.disc(x, y, 0.42, mixed(LIGHT.floor, LIGHT.goal, GOAL_OPACITY), LIGHT.goal, 0.06)
             canvas.text(x, y, str(number), self._font)
         x, y = way[0]
         canvas.disc(x, y, 0.2, LIGHT.robot, LIGHT.robot_edge, 0.06)
@@ -161,10 +163,10 @@ class Renderer:
     def _write(self, image: Image.Image, caption: str) -> None:
         pad = 6 * self._fine
         draw = ImageDraw.Draw(image, "RGBA")
-        position = (2 * pad, image.height - 2 * pad)
-        left, top, right, bottom = draw.textbbox(position, caption, font=self._font, anchor="ld")
+        position = (2 * pad, 2 * pad)
+        left, top, right, bottom = draw.textbbox(position, caption, font=self._font, anchor="la")
         draw.rounded_rectangle((left - pad, top - pad, right + pad, bottom + pad), pad, faded(LIGHT.card, 0.84))
-        draw.text(position, caption, LIGHT.ink, font=self._font, anchor="ld")
+        draw.text(position, caption, LIGHT.ink, font=self._font, anchor="la")
 
 
 def _draw_map(canvas: Canvas, map_: Map) -> None:
@@ -210,14 +212,14 @@ def _runs(mask: np.ndarray) -> list[np.ndarray]:
     return runs
 
 
-def _draw_trail(canvas: Canvas, trail: Sequence[tuple[float, float]]) -> None:
+def _draw_trail(canvas: Canvas, trail: Sequence[tuple[float, float]], width_m: float) -> None:
     """Draw the trail, paler the older it is; opaque, as translucent pieces would show their overlaps."""
     points = np.asarray(trail, np.float64).reshape(-1, 2)
     pieces = 12
     edges = np.linspace(0, len(points) - 1, pieces + 1).astype(int)
     for piece, (first, last) in enumerate(itertools.pairwise(edges)):
         share = 0.25 + 0.65 * piece / pieces
-        canvas.line(points[first : last + 1], mixed(LIGHT.floor, LIGHT.trail, share), 0.07)
+        canvas.line(points[first : last + 1], mixed(LIGHT.floor, LIGHT.trail, share), width_m)
 
 
 def _draw_path(canvas: Canvas, scene: Scene) -> None:
@@ -230,7 +232,7 @@ def _draw_path(canvas: Canvas, scene: Scene) -> None:
     for x, y in scene.waypoints[:-1]:
         canvas.disc(x, y, 0.11, LIGHT.card, LIGHT.way, 0.05)
     goal_x, goal_y = scene.waypoints[-1]
-    canvas.disc(goal_x, goal_y, 0.34, faded(LIGHT.goal, 0.2), LIGHT.goal, 0.06)
+    canvas.disc(goal_x, goal_y, 0.34, mixed(LIGHT.floor, LIGHT.goal, GOAL_OPACITY), LIGHT.goal, 0.06)
     canvas.disc(goal_x, goal_y, 0.15, LIGHT.goal)
 
 

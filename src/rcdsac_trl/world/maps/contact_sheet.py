@@ -16,6 +16,7 @@ from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.maps.shapes import Map
+from rcdsac_trl.world.render import GOAL_OPACITY
 
 _PANEL_INCHES = 3.6
 _HEAD_INCHES, _LEGEND_LINE_INCHES = 0.55, 0.28
@@ -23,7 +24,7 @@ _HEAD_INCHES, _LEGEND_LINE_INCHES = 0.55, 0.28
 _FONT_SIZE, _SMALL_FONT_SIZE = 13, 10
 _MOST_COLUMNS = 4
 _TICKS = 4
-_GOAL_RADII_M, _GOAL_OPACITY = (0.42, 0.2), 0.24
+_GOAL_RADII_M = (0.42, 0.2)
 _GOALS_DRAWN = 30
 _DOTS = (0, (1.0, 1.2))
 
@@ -90,7 +91,7 @@ def draw_map(axes: Axes, map: Map, planner: Planner, rng: np.random.Generator) -
     axes.plot(*true_path.T, color=LIGHT.ink, linewidth=1.5, linestyle=_DOTS)
     axes.plot(*waypoints.T, color=LIGHT.way, linewidth=1.6, marker="o", markersize=4)
     axes.add_patch(Circle((start[0], start[1]), ROBOT_RADIUS_M, facecolor=LIGHT.robot, zorder=3))
-    for radius, fill in zip(_GOAL_RADII_M, (mixed(LIGHT.floor, LIGHT.goal, _GOAL_OPACITY), LIGHT.goal), strict=True):
+    for radius, fill in zip(_GOAL_RADII_M, (mixed(LIGHT.floor, LIGHT.goal, GOAL_OPACITY), LIGHT.goal), strict=True):
         axes.add_patch(Circle((goal[0], goal[1]), radius, facecolor=fill, edgecolor=LIGHT.goal, zorder=3))
 
 
@@ -121,7 +122,7 @@ def _legend() -> list[Patch | Line2D]:
         *areas,
         dot("mover", CAPTIONS["mover"]),
         dot("robot", "start"),
-        dot("goal", "goal", _GOAL_OPACITY),
+        dot("goal", "goal", GOAL_OPACITY),
         Line2D([], [], color=LIGHT.way, linewidth=1.8, marker="o", markersize=5, label="way by what is known"),
         Line2D([], [], color=LIGHT.ink, linewidth=1.8, linestyle=_DOTS, label="true shortest way"),
     ]
