@@ -10,6 +10,7 @@ at, and in how many it was the other way round.
 import sys
 from pathlib import Path
 
+import pandas as pd
 from PIL import Image
 
 from rcdsac_trl.evaluation.film.episode_film import Track
@@ -54,6 +55,21 @@ def spec_of(name: str) -> tuple[EvaluationSpec, Agent]:
     return spec, Agent(packed(average.module), packed_loss(loss))
 
 
+def compared(collisions: pd.DataFrame) -> tuple[int | None, int, int]:
+    """Compare the ends of beta on a map.
+
+    Args:
+        collisions: a row an episode, a column a beta in rising order.
+
+    Returns:
+        The first episode in which the averse end collides less often, None for none; in how many it does; and in how
+        many more often.
+    """
+    averse, neutral = collisions.iloc[:, 0], collisions.iloc[:, -1]
+    fewer = averse < neutral
+    return (int(fewer.idxmax()) if fewer.any() else None), int(fewer.sum()), int((averse > neutral).sum())
+
+
 def chosen(spec: EvaluationSpec, agent: Agent) -> tuple[int, int, str]:
     """Return map and episode of the first one in which beta matters, and what was seen of all until then."""
     fewer = more = looked_at = 0
@@ -61,12 +77,9 @@ def chosen(spec: EvaluationSpec, agent: Agent) -> tuple[int, int, str]:
         for map_index in range(MOST_MAPS):
             episodes = table_of([drive(map_index, lambda: None)])
             collisions = episodes.pivot(index="episode", columns="beta", values="collisions")
-            averse, neutral = collisions.iloc[:, 0], collisions.iloc[:, -1]
-            fewer += int((averse < neutral).sum())
-            more += int((averse > neutral).sum())
-            looked_at += len(collisions)
-            if (averse < neutral).any():
-                episode = int((averse < neutral).idxmax())
+            episode, *counts = compared(collisions)
+            fewer, more, looked_at = fewer + counts[0], more + counts[1], looked_at + len(collisions)
+            if episode is not None:
                 seen = (
                     f"Validation map {map_index}, episode {episode}: the first in which β = {collisions.columns[0]:g} "
                     f"collides less often than β = {collisions.columns[-1]:g}. Of the {looked_at} episodes driven to "
