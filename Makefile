@@ -13,7 +13,7 @@ BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job 
 WORKERS ?= logical
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks docs clean
+.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks pictures docs clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F '|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -56,6 +56,10 @@ notebooks: setup ## run the notebooks anew, in place
 docs: setup ## build the documentation as a site: build/docs/html/index.html
 	$(BIN)/python -m sphinx -E -W --keep-going -q -d build/docs/doctrees docs build/docs/html
 	@echo "Open build/docs/html/index.html in a browser."
+
+pictures: setup ## draw the pictures of docs/images anew, each as CONTRIBUTING.md says; with the film of the page, half an hour
+	$(BIN)/python -m rcdsac_trl.draw_maps split=validation count=4 out=docs/images/maps.png
+	for name in sensor_pictures results_figures ways play_film; do $(BIN)/python docs/images/$$name.py || exit 1; done
 
 format: setup ## let ruff repair what it can
 	$(BIN)/ruff check --fix .

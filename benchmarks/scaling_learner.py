@@ -8,6 +8,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.system import runtime
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
@@ -53,10 +54,9 @@ def draw(curves: dict[str, dict[int, float]], labels: dict[str, str], path: Path
     figure, axes = plt.subplots(1, len(curves), figsize=(4.0 * len(curves), 3.2), sharey=True, layout="constrained")
     for axis, (key, curve) in zip(axes, curves.items(), strict=True):
         sizes, times = list(curve), [1e3 * value for value in curve.values()]
-        axis.loglog(sizes, times, "o-", label="measured", base=2)
-        axis.loglog(
-            sizes, [times[-1] * size / sizes[-1] for size in sizes], ":", color="grey", label="proportional", base=2
-        )
+        proportional = [times[-1] * size / sizes[-1] for size in sizes]
+        axis.loglog(sizes, times, "o-", color=LIGHT.accent, label="measured", base=2)
+        axis.loglog(sizes, proportional, ":", color=LIGHT.faint, label="proportional", base=2)
         axis.set_xticks(sizes, [str(size) for size in sizes])
         axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axis.set_xlabel(labels[key])

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import bench_world as bench
+from rcdsac_trl.colors import LIGHT
 
 IMAGE = Path(__file__).parents[1] / "docs" / "images" / "scaling_world.png"
 AGENTS = (1, 2, 5, 10, 20, 40)
@@ -114,7 +115,7 @@ def draw(curves: dict[str, dict[float, float]], path: Path) -> None:
     }
     figure, axes = plt.subplots(1, 4, figsize=(15, 3.4), layout="constrained")
     for axis, (key, (xlabel, ylabel)) in zip(axes, titles.items(), strict=True):
-        axis.plot(list(curves[key]), list(curves[key].values()), "o-", color="#1f5f99")
+        axis.plot(list(curves[key]), list(curves[key].values()), "o-", color=LIGHT.accent)
         axis.set(xlabel=xlabel, ylabel=ylabel)
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)

@@ -74,7 +74,7 @@ FLOORS = (
 )
 SIDEWAYS = {("deploy", "agent")}
 # Files beside the rooms that serve all of them.
-SHARED = {"errors", "seeding", "tables"}
+SHARED = {"colors", "errors", "seeding", "tables"}
 # A room that reads files alone.
 APART = "report"
 ROOMS = set().union(*FLOORS, {APART})

@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+from rcdsac_trl.colors import LIGHT, rgb
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.evaluation.branches import predict
@@ -24,7 +25,6 @@ from rcdsac_trl.evaluation.film.trajectories import trajectories
 from rcdsac_trl.evaluation.film.video import Frame, write_video
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
-from rcdsac_trl.world.render import FLOOR, MAPPED, ROBOT, TOUCHING
 from still_scene import SIZE_M, scene
 from tiny import STEPS, evaluate, tiny_settings
 
@@ -129,10 +129,12 @@ def test_each_panel_shows_its_own_moment() -> None:
         return tuple(frame[head + round(line), panel * side + round(column)])
 
     for panel in (0, 1):
-        assert color(first, panel, 5.0, 5.0) == MAPPED
-        assert color(first, panel, 1.5, 9.5) == FLOOR
+        assert color(first, panel, 5.0, 5.0) == rgb(LIGHT.mapped)
+        assert color(first, panel, 1.5, 9.5) == rgb(LIGHT.floor)
+    red = rgb(LIGHT.touching)
     touched = [
-        [(frame[:, i * side : (i + 1) * side] == TOUCHING).all(-1).any() for i in (0, 1)] for frame in (first, second)
+        [(frame[head : head + side, i * side : (i + 1) * side] == red).all(-1).any() for i in (0, 1)]
+        for frame in (first, second)
     ]
     assert touched == [[True, False], [False, True]]
 
@@ -145,21 +147,23 @@ def test_ways_show_goals_and_contacts_where_they_were() -> None:
     free = Track("a", [at(2.5, 10.0), at(4.5, 10.0), at(6.5, 10.0)])
     hit = Track("b", [at(2.5, 10.0), at(4.5, 10.0, collisions=1), at(6.5, 10.0, 1), at(8.5, 10.0, 1, goals=1)])
     picture = trajectories([free, hit])
-    side, head = 560, 56
-    assert picture.shape == (side + 3 * head, 2 * side, 3)
+    side, head = 420, 42
+    assert picture.shape[1] == 2 * side
+    assert side + 2 * head < picture.shape[0] < side + 5 * head  # what the colours mean stands below
     scale = side / (1.04 * SIZE_M)
 
     def color(panel: int, x: float, y: float) -> tuple[int, ...]:
         return tuple(picture[head + int((1.02 * SIZE_M - y) * scale), panel * side + int((x + 0.02 * SIZE_M) * scale)])
 
-    assert (color(0, 2.5, 10.1), color(1, 2.5, 10.1)) == (ROBOT, ROBOT)
-    assert color(0, 4.5, 10.15) == FLOOR
-    assert color(1, 4.5, 10.15) == TOUCHING
-    assert color(1, 6.5, 10.15) == FLOOR  # the same contact
-    assert color(0, 13.7, 8.2) == FLOOR  # not reached
-    assert color(1, 13.7, 8.2) != FLOOR
-    texts = [(picture[head + side : 2 * head + side, i * side : (i + 1) * side] == TOUCHING).all(-1) for i in (0, 1)]
-    assert [bool(text.any()) for text in texts] == [False, True]
+    assert (color(0, 2.5, 10.1), color(1, 2.5, 10.1)) == (rgb(LIGHT.robot),) * 2
+    assert color(0, 4.5, 10.15) == rgb(LIGHT.floor)
+    assert color(1, 4.5, 10.15) == rgb(LIGHT.touching)
+    assert color(1, 6.5, 10.15) == rgb(LIGHT.floor)  # the same contact
+    assert color(0, 13.7, 8.2) == rgb(LIGHT.floor)  # not reached
+    assert color(1, 13.7, 8.2) != rgb(LIGHT.floor)
+    below = picture[head + side : 2 * head + side]
+    texts = [(below[:, i * side : (i + 1) * side] == rgb(LIGHT.touching)).all(-1).any() for i in (0, 1)]
+    assert texts == [False, True]
 
 
 # ------------------------------------------------------------------------------------------------ of an evaluation

@@ -343,8 +343,9 @@ def test_contact_sheet_draws_every_map() -> None:
     for index, axes in enumerate(figure.axes):
         map_ = generate_map(MapSettings(), "validation", 1, index)
         assert axes.get_title() == f"validation {index} · {map_.layout}"
-        # Boxes, cylinders, movers and the robot at its start.
-        assert len(axes.patches) == len(map_.boxes) + len(map_.cylinders) + len(map_.movers) + 1
+        # Boxes, cylinders, movers, the robot at its start, and the goal's two rings.
+        assert len(axes.patches) == len(map_.boxes) + len(map_.cylinders) + len(map_.movers) + 3
+        assert [axes.xaxis.get_major_formatter()(metres) for metres in (0.0, 20.0)] == ["0 m", "20 m"]
 
 
 def draw(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> None:

@@ -34,7 +34,7 @@ class ReturnFigure:
             tools="",
             toolbar_location=None,
             x_axis_label="fraction of the return",
-            y_axis_label="return from here on",
+            y_axis_label="return, higher is better",
             title="what it expects of what it does",
             min_border=2,
             output_backend="canvas",
@@ -120,14 +120,12 @@ class ValueFigure:
         self._image = ColumnDataSource(data={"image": [], "x": [], "y": [], "dw": [], "dh": []})
         self._chosen = ColumnDataSource(data={"x": [], "y": [], "marker": [], "size": []})
         plot.image("image", x="x", y="y", dw="dw", dh="dh", source=self._image, color_mapper=self._mapper)
-        plot.scatter(
+        self._marks = plot.scatter(
             "x",
             "y",
             marker="marker",
             size="size",
             source=self._chosen,
-            fill_color="#ffffff",
-            line_color="#d43a2c",
             line_width=2,
         )
         self._bar = ColorBar(color_mapper=self._mapper, width=8, padding=4, title=None, background_fill_alpha=0.0)
@@ -138,6 +136,7 @@ class ValueFigure:
     def restyle(self, colors: Colors) -> None:
         """Take another theme's colours."""
         restyle_plot(self.figure, colors)
+        self._marks.glyph.update(fill_color=colors["arrow"], line_color=colors["alarm"])
         self._bar.major_label_text_color = colors["faint"]
 
     def copy(self, view: RobotView) -> None:

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d, ScaleBar
 from bokeh.models.tools import PanTool, PointDrawTool, ResetTool, WheelZoomTool
-from bokeh.palettes import Plasma256
 from bokeh.plotting import figure
 
+from rcdsac_trl.playground.palette import trail_shades
 from rcdsac_trl.playground.view_state import RobotView
 from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY
 from rcdsac_trl.world.maps.shapes import Map
@@ -82,7 +82,7 @@ class MapFigure:
         plot.grid.visible = False
         plot.outline_line_color = None
         self._sources = {name: ColumnDataSource(data={key: [] for key in keys}) for name, keys in _COLUMNS.items()}
-        speeds = LinearColorMapper(palette=Plasma256[20:240], low=0.0, high=MAX_LINEAR_VELOCITY)
+        self._speeds = LinearColorMapper(low=0.0, high=MAX_LINEAR_VELOCITY)
         plot.patches("xs", "ys", source=self._sources["static"], fill_color="fill", line_color="fill", line_width=0.5)
         plot.circle("x", "y", radius="radius", source=self._sources["round"], fill_color="fill", line_color=None)
         plot.patches("xs", "ys", source=self._sources["fans"], fill_color="fill", fill_alpha="alpha", line_color=None)
@@ -94,7 +94,7 @@ class MapFigure:
             source=self._sources["trail"],
             line_width=3,
             line_cap="round",
-            line_color={"field": "speed", "transform": speeds},
+            line_color={"field": "speed", "transform": self._speeds},
         )
         plot.segment(
             "x0",
@@ -142,6 +142,7 @@ class MapFigure:
         """Take another theme's colours, but for what is copied."""
         self.figure.background_fill_color = colors["floor"]
         self.figure.border_fill_color = colors["outside"]
+        self._speeds.palette = trail_shades(colors)
         # A new one: a browser draws it once.
         if self._scale_bar is not None:
             self.figure.center.remove(self._scale_bar)

@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from rcdsac_trl.colors import beta_shades
 from rcdsac_trl.report.cross_evaluation_report import write_cross_evaluation
 from rcdsac_trl.report.statistics import Array, lower_mean
-from rcdsac_trl.report.style import FAINT, INK, MARKERS, limits, shades, style
+from rcdsac_trl.report.style import FAINT, INK, MARKERS, limits, style
 
 COVERED = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 """Fractions whose coverage is tabulated."""
@@ -127,7 +128,7 @@ def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFr
     covered, transformed, means, shape = figure.subplots(2, 2).flat
     groups = list(predictions.groupby("beta", dropna=False))
     extremes: list[float] = []
-    for number, ((beta, states), color) in enumerate(zip(groups, shades(len(groups)), strict=True)):
+    for number, ((beta, states), color) in enumerate(zip(groups, beta_shades(len(groups)), strict=True)):
         quantiles, realised = _arrays(states, returns)
         error = errors(quantiles, realised)
         marker = MARKERS[number % len(MARKERS)]
@@ -145,8 +146,8 @@ def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFr
         shape.plot(fractions, around, color=color, linewidth=1.2, linestyle="--")
     style(covered, "coverage (dotted: after shifting the level)", "τ", "share of returns below Z_τ")
     style(transformed, "PIT: where returns lie among the quantiles", "share of quantiles below the return", "returns")
-    style(means, "mean return of a state", "predicted", "earned by roll-outs")
-    style(shape, "around the predicted mean: Z_τ (dashed: returns)", "τ", "return")
+    style(means, "mean return of a state, higher is better", "predicted", "earned by roll-outs")
+    style(shape, "around the predicted mean: Z_τ (dashed: returns)", "τ", "return, higher is better")
     covered.set(xlim=(0, 1), ylim=(0, 1))
     covered.plot([0, 1], [0, 1], color=FAINT, linewidth=1.2, linestyle="--", label="true quantiles")
     transformed.axhline(1 / PIT_BINS, color=FAINT, linewidth=1.2, linestyle="--")

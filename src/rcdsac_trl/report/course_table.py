@@ -14,23 +14,23 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
+from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.style import INK
 from rcdsac_trl.report.table import markdown
 
 DIRECTIONS = ("forward", "reverse")
 KEY = ["run", "agent", "beta"]
 
-_SHAPES = {"wall": "#3d4450", "glass": "#7fc4d8", "known": "#aab4c4", "unknown": "#e9b872"}
+_SHAPES = {"wall": LIGHT.wall, "glass": LIGHT.glass, "known": LIGHT.mapped, "unknown": LIGHT.unmapped}
 _SHAPE_NAMES = {
     "wall": "wall",
     "glass": "glass, which cameras do not see",
     "known": "furniture the planner knows",
     "unknown": "furniture it does not know",
 }
-_FLOOR = "#faf9f6"
-_COLORS = {"forward": "#1d6fd1", "reverse": "#8a3fa0"}
-_COURSE = "#2a9d5c"
-_COLLISION = "#d62839"
+_COLORS = {"forward": LIGHT.robot, "reverse": LIGHT.mover}
+_COURSE = LIGHT.way
+_COLLISION = LIGHT.touching
 _PANEL_INCHES = 6.4
 _MAX_COLUMNS = 2
 
@@ -127,7 +127,7 @@ def _title(agent: object, beta: float, runs: pd.DataFrame) -> str:
 def _draw_office(axes: Axes, office: dict[str, Any]) -> None:
     size = office["size_m"]
     axes.set(xlim=(0, size), ylim=(0, size), aspect="equal", xticks=[], yticks=[])
-    axes.set_facecolor(_FLOOR)
+    axes.set_facecolor(LIGHT.floor)
     axes.spines[:].set_visible(False)
     for shape in office["shapes"]:
         color = _SHAPES[shape["kind"]]
@@ -150,7 +150,7 @@ def _draw_runs(axes: Axes, traces: pd.DataFrame) -> None:
         onsets = steps[contact & ~contact.shift(fill_value=False)]
         axes.scatter(onsets["x_m"], onsets["y_m"], s=42, marker="x", color=_COLLISION, linewidths=1.6, zorder=4)
         last = steps.iloc[-1]
-        axes.scatter([last["x_m"]], [last["y_m"]], s=26, color=_COLORS[str(direction)], edgecolor="white", zorder=6)
+        axes.scatter([last["x_m"]], [last["y_m"]], s=26, color=_COLORS[str(direction)], edgecolor=LIGHT.card, zorder=6)
 
 
 def _legend() -> list[Line2D | Patch]:

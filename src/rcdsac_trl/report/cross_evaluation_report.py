@@ -17,8 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.statistics import Array, bootstrap_maps
-from rcdsac_trl.report.style import INK
+from rcdsac_trl.report.style import INK, SIGNED
 
 READINGS = {"state": "in a state", "all": "over all states"}
 """What roll-outs a measure is taken of, and how it is called."""
@@ -144,7 +145,7 @@ def cross_figure(title: str, values: Mapping[str, CrossValues], betas: Array) ->
     largest = max(max(float(np.abs(of.advantage).max()) for of in values.values()), 1e-9)
     panels = figure.subplots(1, len(values))
     for axes, (reading, of) in zip(panels, values.items(), strict=True):
-        image = axes.imshow(of.advantage, cmap="RdBu_r", vmin=-largest, vmax=largest, aspect="auto")
+        image = axes.imshow(of.advantage, cmap=SIGNED, vmin=-largest, vmax=largest, aspect="auto")
         heading = f"{READINGS[reading].capitalize()}: the diagonal is\n{_best_rows(of)}"
         axes.set_title(heading, loc="left", fontsize=10, color=INK)
         axes.set_xticks(range(len(betas)), [f"{beta:g}" for beta in betas])
@@ -167,7 +168,7 @@ def _write_cells(axes: Axes, values: CrossValues, dark: float) -> None:
         on_diagonal = row == column
         number = f"{values.value[row, column]:.1f}" if on_diagonal else f"{advantage:+.1f}"
         low, high = (values.value_bounds if on_diagonal else values.advantage_bounds)[:, row, column]
-        color = "white" if abs(advantage) > dark else INK
+        color = LIGHT.card if abs(advantage) > dark else INK
         axes.text(column, row - 0.1, number, ha="center", va="center", fontsize=11, color=color)
         axes.text(column, row + 0.22, f"[{low:.1f}, {high:.1f}]", ha="center", va="center", fontsize=7.5, color=color)
     for row, column in enumerate(values.value.argmax(1)):

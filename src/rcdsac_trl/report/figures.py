@@ -9,12 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
+from rcdsac_trl.colors import LIGHT, mixed
 from rcdsac_trl.report import statistics
 from rcdsac_trl.report.collision_report import THINGS
 from rcdsac_trl.report.findings import TAILS, bounded, labels
 from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.statistics import Statistic
-from rcdsac_trl.report.style import FAINT, INK, MARKERS, shades, style
+from rcdsac_trl.report.style import FAINT, INK, MARKERS, series, style
 
 # What follows beta, in four panels.
 _RESPONSES: dict[str, tuple[str, Statistic]] = {
@@ -25,11 +26,11 @@ _RESPONSES: dict[str, tuple[str, Statistic]] = {
 }
 _LEARNT = ("reward", "collisions")
 _THING_COLORS = {
-    "outer_wall": "#3d4450",
-    "inner_wall": "#737d8f",
-    "mapped_clutter": "#aab4c4",
-    "unmapped_clutter": "#e9b872",
-    "mover": "#8a3fa0",
+    "outer_wall": LIGHT.wall,
+    "inner_wall": mixed(LIGHT.wall, LIGHT.mapped, 0.45),
+    "mapped_clutter": LIGHT.mapped,
+    "unmapped_clutter": LIGHT.unmapped,
+    "mover": LIGHT.mover,
 }
 _OUTSIDE = "////"  # hatching
 
@@ -61,7 +62,7 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
     )
     panels = figure.subplots(2, 2).flat
     for axes, (heading, (metric, statistic)) in zip(panels, _RESPONSES.items(), strict=True):
-        for number, ((key, rows), color) in enumerate(zip(groups, shades(len(groups)), strict=True)):
+        for number, ((key, rows), color) in enumerate(zip(groups, series(len(groups)), strict=True)):
             ordered = rows.sort_values("beta")
             values = [episodes.of(condition, metric) for _, condition in ordered.iterrows()]
             marker = MARKERS[number % len(MARKERS)]
@@ -126,7 +127,7 @@ def collision_causes(summary: pd.DataFrame) -> Figure:
             outside = parts.at[thing, "per_episode"] * parts.at[thing, "outside_share"]
             for width, hatch in ((parts.at[thing, "per_episode"] - outside, ""), (outside, _OUTSIDE)):
                 axes.barh(
-                    row, width, 0.7, left, color=_THING_COLORS[thing], hatch=hatch, edgecolor="white", linewidth=0
+                    row, width, 0.7, left, color=_THING_COLORS[thing], hatch=hatch, edgecolor=LIGHT.card, linewidth=0
                 )
                 left += width
         axes.annotate(f"{left:.2f}", (left, row), xytext=(5, 0), textcoords="offset points", va="center", color=INK)
@@ -137,7 +138,7 @@ def collision_causes(summary: pd.DataFrame) -> Figure:
     axes.margins(x=0.08)
     axes.invert_yaxis()
     handles = [Patch(color=_THING_COLORS[thing], label=name) for thing, name in THINGS.items()]
-    handles.append(Patch(facecolor=FAINT, hatch=_OUTSIDE, edgecolor="white", label="outside the sensor's sectors"))
+    handles.append(Patch(facecolor=FAINT, hatch=_OUTSIDE, edgecolor=LIGHT.card, label="outside the sensor's sectors"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
@@ -156,7 +157,7 @@ def learning_curves(runs: Mapping[str, pd.DataFrame]) -> Figure:
     for column, (clock, label, scale) in enumerate(shown):
         for row, metric in enumerate(_LEARNT):
             axes = panels[row][column]
-            for number, ((name, rows), color) in enumerate(zip(runs.items(), shades(len(runs)), strict=True)):
+            for number, ((name, rows), color) in enumerate(zip(runs.items(), series(len(runs)), strict=True)):
                 if clock not in rows:
                     continue
                 means = rows.groupby(clock)[metric].mean()
@@ -178,7 +179,7 @@ def _draw_intervals(
     axes: Axes,
     x: pd.Series,
     intervals: list[statistics.Interval],
-    color: tuple[float, float, float, float],
+    color: str,
     marker: str,
     label: str,
 ) -> None:
@@ -193,7 +194,7 @@ def _draw_turned(
     of: pd.Series,
     metric: str,
     statistic: Statistic,
-    color: tuple[float, float, float, float],
+    color: str,
 ) -> None:
     """Draw the controllers of an agent, each as a point with its interval and name."""
     conditions = episodes.conditions
@@ -202,7 +203,9 @@ def _draw_turned(
         beta = statistics.mean(episodes.of(condition, "mean_beta"))
         found = bounded(episodes.of(condition, metric), metric, statistic)
         axes.plot([beta, beta], [found.low, found.high], color=color, linewidth=1.2)
-        axes.plot(beta, found.value, marker="*", markersize=11, color=color, markeredgecolor="white", linestyle="none")
+        axes.plot(
+            beta, found.value, marker="*", markersize=11, color=color, markeredgecolor=LIGHT.card, linestyle="none"
+        )
         name = condition["beta_controller"].replace("_", " ")
         at = (beta, found.value)
         axes.annotate(name, at, textcoords="offset points", xytext=(6, 4), fontsize=8, color=INK)

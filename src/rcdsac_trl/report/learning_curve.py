@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
 
-from rcdsac_trl.report.style import FAINT, INK, MARKERS, shades, style
+from rcdsac_trl.colors import beta_shades
+from rcdsac_trl.report.style import FAINT, INK, MARKERS, style
 
 PANELS: Mapping[str, str] = {
     "reward": "reward per episode",
@@ -39,7 +40,7 @@ class Curve:
     """One line of every panel: the means of each metric, indexed by the number of updates."""
 
     label: str
-    color: str | tuple[float, float, float, float]
+    color: str
     marker: str
     means: pd.DataFrame
 
@@ -53,7 +54,7 @@ def validation_curves(episodes: pd.DataFrame) -> list[Curve]:
     # Groups come in ascending order.
     groups = list(episodes.groupby(list(CONDITIONS), dropna=False))
     curves = []
-    for number, ((values, rows), color) in enumerate(zip(groups, shades(len(groups)), strict=True)):
+    for number, ((values, rows), color) in enumerate(zip(groups, beta_shades(len(groups)), strict=True)):
         # A missing value is not equal to itself: a condition has one of the two, or neither.
         named = [
             f", {_SYMBOLS[key]} = {value:g}" for key, value in zip(CONDITIONS, values, strict=True) if value == value

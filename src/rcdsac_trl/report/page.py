@@ -8,17 +8,21 @@ from html import escape
 import pandas as pd
 from matplotlib.figure import Figure
 
+from rcdsac_trl.colors import LIGHT, css_variables
 from rcdsac_trl.report.table import html
 
-_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #3d4450; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
+_STYLE = (
+    f":root {{ {css_variables(LIGHT)} }}"
+    """
+body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 68rem; margin: 2rem auto; padding: 0 1rem; }
 h1, h2 { font-weight: 600; line-height: 1.2; }
 img { max-width: 100%; }
 .table { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; padding: 0.2rem 0.6rem; border-bottom: 1px solid #e9ebef; white-space: nowrap; }
-th { border-bottom: 1px solid #9aa3b2; }
+th, td { text-align: left; padding: 0.2rem 0.6rem; border-bottom: 1px solid var(--edge); white-space: nowrap; }
+th { border-bottom: 1px solid var(--faint); }
 """
+)
 
 Part = str | pd.DataFrame | Figure
 

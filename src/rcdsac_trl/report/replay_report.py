@@ -12,11 +12,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.page import Part, page
 from rcdsac_trl.report.style import FAINT, GRID, INK, style
 
-_AGENT, _RECORDED, _MEASURED = "#1d6fd1", "#e9962e", "#9aa3b2"
-_STOPPED, _LIMITED = "#d62839", "#e9b872"
+_AGENT, _RECORDED, _MEASURED = LIGHT.robot, LIGHT.mover, LIGHT.mapped
+_STOPPED, _LIMITED = LIGHT.alarm, LIGHT.unmapped
 _TAIL = 0.1
 # Velocities are drawn from here on both sides of 0, m/s or rad/s: what is less is nothing.
 _LEAST_SHOWN = 0.1
@@ -165,7 +166,7 @@ def _draw_velocity(axes: Axes, commands: pd.DataFrame, column: str, title: str) 
 
 def _draw_quantiles(axes: Axes, commands: pd.DataFrame, fractions: np.ndarray) -> None:
     columns = [name for name in commands if str(name).startswith("q") and str(name)[1:].isdigit()]
-    style(axes, "return it expected: mean, and quantiles (dark: the middle half; red: the worst tenth)")
+    style(axes, "return it expected, higher is better: mean, quantiles (dark: the middle half; red: the worst tenth)")
     if not columns:
         axes.plot(commands["time_s"], commands["value"], color=_AGENT, linewidth=1.4)
         return

@@ -2,23 +2,21 @@
 
 from collections.abc import Sequence
 
-import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 
-INK = "#3d4450"
-FAINT = "#9aa3b2"
-GRID = "#e9ebef"
+from rcdsac_trl.colors import LIGHT, SERIES
+
+INK, FAINT, GRID = LIGHT.ink, LIGHT.faint, LIGHT.grid
 MARKERS = "osD^vP"
 """Shapes tell lines apart where colours do not."""
-
-# Dark is the lowest value; the map's pale end is left out.
-_COLORS = matplotlib.colormaps["viridis"]
-_PALEST = 0.85
+SIGNED = LinearSegmentedColormap.from_list("signed", (LIGHT.robot, LIGHT.card, LIGHT.unmapped))
+"""From below zero over nothing to above it."""
 
 
-def shades(number: int) -> list[tuple[float, float, float, float]]:
-    """Return so many colours for ordered values, from the lowest, which is dark, to the highest."""
-    return [_COLORS(_PALEST * i / max(number - 1, 1)) for i in range(number)]
+def series(number: int) -> list[str]:
+    """Return so many colours for things that have names; from the seventh on they come again, with other markers."""
+    return [SERIES[i % len(SERIES)] for i in range(number)]
 
 
 def style(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:

@@ -7,37 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
+from rcdsac_trl.colors import CAPTIONS, LIGHT, faded
 from rcdsac_trl.deploy.policy.policy import fractions_of
 from rcdsac_trl.evaluation.film.recording import Moment
 from rcdsac_trl.evaluation.film.video import Frame
-from rcdsac_trl.world.render import (
-    GOAL,
-    GRID,
-    HIT,
-    MAPPED,
-    MOVER,
-    SEEN,
-    TEXT,
-    TOUCHING,
-    UNMAPPED,
-    Color,
-    Renderer,
-    font,
-)
+from rcdsac_trl.world.canvas import font
+from rcdsac_trl.world.legend import legend
+from rcdsac_trl.world.render import SEEN_OPACITY, Renderer
 
 # A film is at most four episodes wide, of which the fewer the larger.
 COLUMNS = 4
 _SIDES_PX = {1: 720, 2: 640, 3: 512}
 _SMALLEST_SIDE_PX = 480
-PAPER = (255, 255, 255)
-FAINT = (122, 130, 143)
 # How many times finer curves are drawn than shown.
 _FINE = 2
 # The worst of the return, marked in the panel of quantiles.
 _TAIL = 0.1
-
-
-_LEGEND: dict[str, Color] = {"known to the planner": MAPPED, "only sensed": UNMAPPED, "walking": MOVER, "goal": GOAL}
+_SHOWN = ("robot", "seen", "trail", "way", "wall", "mapped", "unmapped", "mover", "touching")
+_LEGEND = {name: CAPTIONS[name] for name in _SHOWN}
 
 
 @dataclass(frozen=True)
@@ -67,9 +54,9 @@ def film(tracks: Sequence[Track], period_s: float) -> Iterator[Frame]:
     lines = math.ceil(len(tracks) / columns)
     side = _SIDES_PX.get(columns, _SMALLEST_SIDE_PX)
     panel, renderer = _Panel(side, _limits(tracks)), Renderer(side)
-    legend = _legend(columns * side, side)
-    sheet = Image.new("RGB", (columns * side, lines * panel.height + legend.height), PAPER)
-    sheet.paste(legend, (0, lines * panel.height))
+    meanings = legend(_LEGEND, columns * side, 0.026 * side)
+    sheet = Image.new("RGB", (columns * side, lines * panel.height + meanings.height), LIGHT.card)
+    sheet.paste(meanings, (0, lines * panel.height))
     turned = [len({moment.beta for moment in track.moments}) > 1 for track in tracks]
     for step, moments in enumerate(zip(*(track.moments for track in tracks), strict=True)):
         for number, (track, moment) in enumerate(zip(tracks, moments, strict=True)):
@@ -77,20 +64,6 @@ def film(tracks: Sequence[Track], period_s: float) -> Iterator[Frame]:
             drawn = panel.draw(track.heading, f"{beta}{step * period_s:.0f} s", moment, renderer)
             sheet.paste(drawn, (number % columns * side, number // columns * panel.height))
         yield np.array(sheet)
-
-
-def _legend(width: int, side: int) -> Image.Image:
-    """Draw the line below all panels that says what colours mean."""
-    size = 0.026 * side
-    image = Image.new("RGB", (width, 2 * round(size)), PAPER)
-    draw, text = ImageDraw.Draw(image), font(size)
-    left, middle = size, image.height / 2
-    for name, color in _LEGEND.items():
-        draw.ellipse((left, middle - size / 2, left + size, middle + size / 2), color)
-        left += 1.5 * size
-        draw.text((left, middle), name, FAINT, font=text, anchor="lm")
-        left += draw.textlength(name, font=text) + 2 * size
-    return image
 
 
 def _limits(tracks: Sequence[Track]) -> tuple[float, float] | None:
@@ -127,20 +100,22 @@ class _Panel:
 
     def draw(self, heading: str, right: str, moment: Moment, renderer: Renderer) -> Image.Image:
         """Return the panel, [height, side], with two texts at its upper edge."""
-        image = Image.new("RGB", (self._side, self.height), PAPER)
+        image = Image.new("RGB", (self._side, self.height), LIGHT.card)
         image.paste(Image.fromarray(renderer.draw(moment.scene)), (0, self._head))
         draw = ImageDraw.Draw(image)
         middle = self._head // 2
-        draw.text((self._pad, middle), heading, TEXT, font=self._large, anchor="lm")
-        draw.text((self._side - self._pad, middle), right, FAINT, font=self._normal, anchor="rm")
+        draw.text((self._pad, middle), heading, LIGHT.ink, font=self._large, anchor="lm")
+        draw.text((self._side - self._pad, middle), right, LIGHT.faint, font=self._normal, anchor="rm")
         middle = self._head + self._side + self._foot // 2
         speed = f"{moment.speed_m_per_s + 0.0:.2f} m/s"
-        draw.text((self._pad, middle), speed, TEXT, font=self._normal, anchor="lm")
-        hit = TOUCHING if moment.scene.in_contact else TEXT
+        draw.text((self._pad, middle), speed, LIGHT.ink, font=self._normal, anchor="lm")
+        hit = LIGHT.alarm if moment.scene.in_contact else LIGHT.ink
         draw.text(
             (0.42 * self._side, middle), counted(moment.collisions, "collision"), hit, font=self._normal, anchor="lm"
         )
-        draw.text((self._side - self._pad, middle), counted(moment.goals, "goal"), TEXT, font=self._normal, anchor="rm")
+        draw.text(
+            (self._side - self._pad, middle), counted(moment.goals, "goal"), LIGHT.ink, font=self._normal, anchor="rm"
+        )
         if self._limits is not None and moment.quantiles is not None:
             curve = self._quantiles(moment.quantiles, self._limits)
             image.paste(curve, (0, self._head + self._side + self._foot))
@@ -151,7 +126,7 @@ class _Panel:
         width, height = self._side * _FINE, self._curve * _FINE
         left, right = round(0.14 * width), width - self._pad * _FINE
         top, bottom = round(0.06 * height), round(0.80 * height)
-        image = Image.new("RGB", (width, height), PAPER)
+        image = Image.new("RGB", (width, height), LIGHT.card)
         draw = ImageDraw.Draw(image, "RGBA")
         low, high = limits
 
@@ -161,18 +136,18 @@ class _Panel:
         fractions = fractions_of(len(quantiles)).tolist()
         points = [(left + x * (right - left), line_of(y)) for x, y in zip(fractions, quantiles.tolist(), strict=True)]
         tail = left + _TAIL * (right - left)
-        draw.rectangle((left, top, tail, bottom), (*TOUCHING, 36))
-        draw.line((left, bottom, right, bottom), GRID, 2 * _FINE)
-        draw.polygon([(points[0][0], bottom), *points, (points[-1][0], bottom)], SEEN)
-        draw.line(points, HIT, 2 * _FINE, joint="curve")
+        draw.rectangle((left, top, tail, bottom), faded(LIGHT.alarm, 0.14))
+        draw.line((left, bottom, right, bottom), LIGHT.grid, 2 * _FINE)
+        draw.polygon([(points[0][0], bottom), *points, (points[-1][0], bottom)], faded(LIGHT.accent, SEEN_OPACITY))
+        draw.line(points, LIGHT.accent, 2 * _FINE, joint="curve")
         if low < 0 < high:
-            draw.line((left, line_of(0), right, line_of(0)), FAINT, _FINE)
+            draw.line((left, line_of(0), right, line_of(0)), LIGHT.faint, _FINE)
         for value in (quantiles[0], quantiles[-1]):
-            draw.line((left - 4 * _FINE, line_of(value), left, line_of(value)), HIT, _FINE)
+            draw.line((left - 4 * _FINE, line_of(value), left, line_of(value)), LIGHT.accent, _FINE)
         lowest, highest = line_of(quantiles[0]), line_of(quantiles[-1])
         apart = max(0.0, self._small.size - (lowest - highest)) / 2  # so that neither covers the other
         for value, line in ((quantiles[0], lowest + apart), (quantiles[-1], highest - apart)):
-            draw.text((left - 6 * _FINE, line), f"{value:.1f}", TEXT, font=self._small, anchor="rm")
-        caption = "return from here on, by fraction (red: the worst tenth)"
-        draw.text(((left + right) / 2, (bottom + height) / 2), caption, FAINT, font=self._small, anchor="mm")
+            draw.text((left - 6 * _FINE, line), f"{value:.1f}", LIGHT.ink, font=self._small, anchor="rm")
+        caption = "return from here on, higher is better: worst (red) to best"
+        draw.text(((left + right) / 2, (bottom + height) / 2), caption, LIGHT.faint, font=self._small, anchor="mm")
         return image.reduce(_FINE)

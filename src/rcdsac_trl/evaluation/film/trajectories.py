@@ -8,39 +8,47 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from rcdsac_trl.evaluation.film.episode_film import COLUMNS, FAINT, PAPER, Track, counted
+from rcdsac_trl.colors import CAPTIONS, LIGHT
+from rcdsac_trl.evaluation.film.episode_film import COLUMNS, Track, counted
 from rcdsac_trl.evaluation.film.recording import Moment
-from rcdsac_trl.world.render import TEXT, TOUCHING, Renderer, font
+from rcdsac_trl.world.canvas import font
+from rcdsac_trl.world.legend import legend
+from rcdsac_trl.world.render import Renderer
 
-_SIDE_PX = 560
-_LEGEND = "pale to dark: the way driven; numbered: goals reached;\nred: where a contact began; who walks is not shown"
+_SIDE_PX = 420
+_LEGEND = {
+    "robot": "start",
+    "trail": "where it drove, pale to dark",
+    "goal": "goals reached, in order",
+    "touching": "a contact began",
+    **{name: CAPTIONS[name] for name in ("wall", "mapped", "unmapped")},
+}
 
 
 def trajectories(tracks: Sequence[Track]) -> NDArray[np.uint8]:
     """Return the picture, uint8 RGB ``[height, width, 3]``: a panel an episode, at most four in a line.
 
-    Above each map stands what drove, below it what came of it.
+    Above each map stands what drove, below it what came of it. Who walks is not shown.
 
     Args:
         tracks: whole episodes.
     """
     renderer, head = Renderer(_SIDE_PX), round(0.1 * _SIDE_PX)
     columns = min(len(tracks), COLUMNS)
-    height = _SIDE_PX + 2 * head
-    sheet = Image.new("RGB", (columns * _SIDE_PX, math.ceil(len(tracks) / columns) * height + head), PAPER)
+    lines, height = math.ceil(len(tracks) / columns), _SIDE_PX + 2 * head
+    large, normal = font(0.052 * _SIDE_PX), font(0.045 * _SIDE_PX)
+    meanings = legend(_LEGEND, columns * _SIDE_PX, 0.045 * _SIDE_PX)
+    sheet = Image.new("RGB", (columns * _SIDE_PX, lines * height + meanings.height), LIGHT.card)
+    sheet.paste(meanings, (0, lines * height))
     draw = ImageDraw.Draw(sheet)
-    large, normal = font(0.042 * _SIDE_PX), font(0.034 * _SIDE_PX)
     for number, track in enumerate(tracks):
         left, top = number % columns * _SIDE_PX, number // columns * height
         sheet.paste(Image.fromarray(_panel(track.moments, renderer)), (left, top + head))
-        draw.text((left + _SIDE_PX // 2, top + head // 2), track.heading, TEXT, font=large, anchor="mm")
+        draw.text((left + _SIDE_PX // 2, top + head // 2), track.heading, LIGHT.ink, font=large, anchor="mm")
         last = track.moments[-1]
-        colour = TOUCHING if last.collisions else TEXT
+        colour = LIGHT.touching if last.collisions else LIGHT.ink
         below = (left + _SIDE_PX // 2, top + head + _SIDE_PX + head // 2)
         draw.text(below, _outcome(track.moments), colour, font=normal, anchor="mm")
-    small = font(0.027 * _SIDE_PX)
-    middle = (_SIDE_PX * columns // 2, sheet.height - head // 2)
-    draw.multiline_text(middle, _LEGEND, FAINT, font=small, anchor="mm", align="center")
     return np.array(sheet)
 
 

@@ -7,24 +7,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from rcdsac_trl.colors import CAPTIONS, LIGHT, mixed
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.maps.planner import Planner
 from rcdsac_trl.world.maps.shapes import Map
+from rcdsac_trl.world.render import GOAL_OPACITY
 
-_FLOOR = "#f7f5f0"
-_WALL = "#3d4450"
-_MAPPED = "#8d99ae"
-_UNMAPPED = "#e07a3f"
-_MOVER = "#7b4fa3"
-_START = "#2a9d5c"
-_GOAL = "#d62839"
-_WAYPOINTS = "#1d6fd1"
-_TRUE_PATH = "#2b2b2b"
 _PANEL_INCHES = 3.6
+_HEAD_INCHES, _LEGEND_LINE_INCHES = 0.55, 0.28
+# Points; a sheet of four columns is shown at half its size.
+_FONT_SIZE, _SMALL_FONT_SIZE = 13, 10
+_MOST_COLUMNS = 4
+_TICKS = 4
+_GOAL_RADII_M = (0.42, 0.2)
 _GOALS_DRAWN = 30
 _DOTS = (0, (1.0, 1.2))
 
@@ -39,21 +39,30 @@ def contact_sheet(maps: Sequence[Map], split: Split, seed: int, *, drawn: Callab
         drawn: called after each map.
     """
     count = len(maps)
-    columns = min(count, 4)
+    columns = min(count, _MOST_COLUMNS)
     rows = -(-count // columns)
-    size = (columns * _PANEL_INCHES, rows * (_PANEL_INCHES + 0.25) + 0.7)
+    meanings = _legend()
+    legend_inches = (-(-len(meanings) // columns) + 0.5) * _LEGEND_LINE_INCHES
+    size = (columns * _PANEL_INCHES, rows * (_PANEL_INCHES + _HEAD_INCHES) + legend_inches)
     figure = Figure(figsize=size, layout="constrained")
     for index, map_ in enumerate(maps):
         axes = figure.add_subplot(rows, columns, index + 1)
-        axes.set_title(f"{split} {index} · {map_.layout}", fontsize=9, color=_WALL)
+        axes.set_title(f"{split} {index} · {map_.layout}", fontsize=_FONT_SIZE, color=LIGHT.ink)
         draw_map(axes, map_, Planner(map_), stream(seed, f"draw/{split}", index))
         drawn()
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=min(columns, 4), frameon=False)
+    figure.legend(
+        handles=meanings,
+        loc="outside lower center",
+        ncols=columns,
+        frameon=False,
+        fontsize=_FONT_SIZE,
+        labelcolor=LIGHT.ink,
+    )
     return figure
 
 
 def draw_map(axes: Axes, map: Map, planner: Planner, rng: np.random.Generator) -> None:
-    """Draw one map, with a start and a goal and the paths between them.
+    """Draw one map, with a start and a goal and the paths between them, and metres along its lower edge.
 
     Args:
         axes: where to draw.
@@ -61,25 +70,34 @@ def draw_map(axes: Axes, map: Map, planner: Planner, rng: np.random.Generator) -
         planner: the map's planner.
         rng: draws start, goal and the movers' places.
     """
-    axes.set(xlim=(0, map.size_m), ylim=(0, map.size_m), aspect="equal", xticks=[], yticks=[])
-    axes.set_facecolor(_FLOOR)
+    axes.set(xlim=(0, map.size_m), ylim=(0, map.size_m), aspect="equal", yticks=[])
+    axes.xaxis.set_major_locator(MaxNLocator(_TICKS, steps=[1, 2, 5, 10]))
+    axes.xaxis.set_major_formatter("{x:g} m")
+    axes.tick_params(length=3, color=LIGHT.faint, labelcolor=LIGHT.faint, labelsize=_SMALL_FONT_SIZE)
+    axes.set_facecolor(LIGHT.floor)
     axes.spines[:].set_visible(False)
     for box in map.boxes:
-        color = _WALL if box.wall else _MAPPED if box.mapped else _UNMAPPED
-        axes.add_patch(Polygon(box.corners(), facecolor=color))
+        fill, edge = (LIGHT.wall, LIGHT.wall) if box.wall else _clutter(box.mapped)
+        axes.add_patch(Polygon(box.corners(), facecolor=fill, edgecolor=edge))
     for cylinder in map.cylinders:
-        color = _MAPPED if cylinder.mapped else _UNMAPPED
-        axes.add_patch(Circle((cylinder.x, cylinder.y), cylinder.radius, facecolor=color))
+        fill, edge = _clutter(cylinder.mapped)
+        axes.add_patch(Circle((cylinder.x, cylinder.y), cylinder.radius, facecolor=fill, edgecolor=edge))
     for mover in map.movers:
         x, y = planner.sample_mover_point(rng)
-        axes.add_patch(Circle((x, y), mover.radius, facecolor=_MOVER, edgecolor="white", linewidth=0.6))
+        axes.add_patch(Circle((x, y), mover.radius, facecolor=LIGHT.mover, edgecolor=LIGHT.card, linewidth=0.6))
     start, goal = _places(map, planner, rng)
     true_path = np.vstack([start, planner.true_path(start, goal)])
     waypoints = np.vstack([start, planner.waypoints(start, goal)])
-    axes.plot(*true_path.T, color=_TRUE_PATH, linewidth=1.1, linestyle=_DOTS)
-    axes.plot(*waypoints.T, color=_WAYPOINTS, linewidth=1.3, marker="o", markersize=3)
-    axes.add_patch(Circle((start[0], start[1]), ROBOT_RADIUS_M, facecolor=_START, zorder=3))
-    axes.plot(*goal, color=_GOAL, marker="*", markersize=10, markeredgecolor="white", markeredgewidth=0.6)
+    axes.plot(*true_path.T, color=LIGHT.ink, linewidth=1.5, linestyle=_DOTS)
+    axes.plot(*waypoints.T, color=LIGHT.way, linewidth=1.6, marker="o", markersize=4)
+    axes.add_patch(Circle((start[0], start[1]), ROBOT_RADIUS_M, facecolor=LIGHT.robot, zorder=3))
+    for radius, fill in zip(_GOAL_RADII_M, (mixed(LIGHT.floor, LIGHT.goal, GOAL_OPACITY), LIGHT.goal), strict=True):
+        axes.add_patch(Circle((goal[0], goal[1]), radius, facecolor=fill, edgecolor=LIGHT.goal, zorder=3))
+
+
+def _clutter(mapped: bool) -> tuple[str, str]:
+    """Return the colours of a piece of clutter and of its outline."""
+    return (LIGHT.mapped, LIGHT.mapped_edge) if mapped else (LIGHT.unmapped, LIGHT.unmapped_edge)
 
 
 def _places(map: Map, planner: Planner, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -94,16 +112,17 @@ def _places(map: Map, planner: Planner, rng: np.random.Generator) -> tuple[NDArr
 
 
 def _legend() -> list[Patch | Line2D]:
-    def dot(color: str, marker: str, label: str, size: float = 8) -> Line2D:
-        return Line2D([], [], color=color, marker=marker, linestyle="", markersize=size, label=label)
+    def dot(name: str, caption: str, opacity: float = 1.0) -> Line2D:
+        color: str = getattr(LIGHT, name)
+        fill = mixed(LIGHT.card, color, opacity)
+        return Line2D([], [], color=color, markerfacecolor=fill, marker="o", linestyle="", markersize=9, label=caption)
 
+    areas = [Patch(color=getattr(LIGHT, name), label=CAPTIONS[name]) for name in ("wall", "mapped", "unmapped")]
     return [
-        Patch(color=_WALL, label="wall"),
-        Patch(color=_MAPPED, label="clutter, mapped"),
-        Patch(color=_UNMAPPED, label="clutter, unmapped"),
-        dot(_MOVER, "o", "mover"),
-        dot(_START, "o", "start"),
-        dot(_GOAL, "*", "goal", 11),
-        Line2D([], [], color=_WAYPOINTS, marker="o", markersize=3, label="waypoints (what the planner knows)"),
-        Line2D([], [], color=_TRUE_PATH, linestyle=_DOTS, label="true shortest path"),
+        *areas,
+        dot("mover", CAPTIONS["mover"]),
+        dot("robot", "start"),
+        dot("goal", "goal", GOAL_OPACITY),
+        Line2D([], [], color=LIGHT.way, linewidth=1.8, marker="o", markersize=5, label="way by what is known"),
+        Line2D([], [], color=LIGHT.ink, linewidth=1.8, linestyle=_DOTS, label="true shortest way"),
     ]

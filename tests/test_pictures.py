@@ -1,0 +1,64 @@
+"""The pictures of docs/images whose scene a rule chooses: that it is the rule that their captions tell."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pandas as pd
+import pytest
+
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
+
+
+def program(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"picture_{name}", IMAGES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # its dataclasses look themselves up there
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_ways_are_of_the_first_episode_in_which_the_averse_end_collides_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    ways = program("ways", monkeypatch)
+    collisions = pd.DataFrame({-2.0: [1, 0, 2, 0, 0], -1.0: [9, 0, 0, 0, 0], 0.0: [1, 0, 1, 3, 1]})
+    assert ways.compared(collisions) == (3, 2, 1)
+    assert ways.compared(collisions.iloc[:3]) == (None, 0, 1)
+
+
+class Staged:
+    """A drive whose robots begin to touch something in given steps."""
+
+    def __init__(self, careful: int | None, neutral: int | None) -> None:
+        self.contacts = (careful, neutral)
+        self.steps = 0
+
+    def step(self) -> None:
+        self.steps += 1
+
+    @property
+    def robots(self) -> list[SimpleNamespace]:
+        return [SimpleNamespace(collisions=int(at is not None and self.steps >= at)) for at in self.contacts]
+
+
+@pytest.mark.parametrize(
+    ("careful", "neutral", "shown"),
+    [
+        (None, 100, 100),
+        (115, 100, 100),  # after the film
+        (114, 100, None),  # in it
+        (90, 100, None),
+        (None, 44, None),  # the film would begin before the drive
+        (None, 45, 45),
+        (None, 299, 299),
+        (None, 300, None),  # too late
+        (None, None, None),
+    ],
+)
+def test_the_film_of_the_page_is_of_a_contact_of_the_neutral_robot_alone(
+    careful: int | None, neutral: int | None, shown: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("playwright")
+    assert program("play_film", monkeypatch).first_contact(Staged(careful, neutral)) == shown
