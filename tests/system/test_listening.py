@@ -12,7 +12,7 @@ def test_a_free_port_is_let_through_and_one_in_use_is_named_once() -> None:
     check_can_listen("127.0.0.1", 0)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(UserInputError, match=rf"^port={port} on host=127.0.0.1 is in use: choose .* port=0") as told:
+        with pytest.raises(UserInputError, match=rf"^port={port} on host=127.0.0.1 is in use: .* port=0") as told:
             check_can_listen("127.0.0.1", port)
     assert str(told.value).count("127.0.0.1") == 1
 
