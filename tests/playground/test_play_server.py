@@ -74,7 +74,7 @@ def _refused(server: PlayServer, path: str, name: str | None = None) -> tuple[in
         _get(server, path, name)
     with refused.value as answer:
         page = answer.read().decode()
-    told = re.search(r'<p id="sentence">(.*?)( <a|</p>)', page)
+    told = re.search(r'<p id="sentence">(.*?)\. ?(<a|</p>)', page)
     assert told is not None
     return refused.value.code, told[1]
 

@@ -139,9 +139,7 @@ class Controls:
             self._stop.active = choice.stop
             for slider, robot in zip(self.betas, view.robots, strict=False):
                 dial = robot.dial
-                slider.update(show_value=dial is not None, disabled=dial is None)
-                if dial is None:
-                    slider.title = f"{robot.name} has no β"
-                else:
+                slider.update(visible=dial is not None, disabled=dial is None)
+                if dial is not None:
                     slider.update(start=dial.low, end=dial.high, value=robot.dialled)
                     slider.title = f"{dial.symbol} of {robot.name}"

@@ -67,7 +67,7 @@ class _Refused(Matcher):
 def _answer(request: HTTPServerRequest, status: int, sentence: str) -> None:
     page, css = ((_HERE / name).read_text("utf-8") for name in ("refusal.html", "page.css"))
     told = Template(page).substitute(
-        palettes=style_sheet(), css=css, sentence=escape(sentence), way_on=_WAYS_ON[status]
+        palettes=style_sheet(), css=css, sentence=escape(sentence) + ".", way_on=_WAYS_ON[status]
     )
     body = told.encode()
     headers = HTTPHeaders(

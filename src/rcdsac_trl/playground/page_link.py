@@ -9,6 +9,7 @@ from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.palette import THEMES
 from rcdsac_trl.playground.scene_choice import SceneChoice, shortened
 
+_CAREFUL = 0.25
 # What a link may say of the page itself.
 _OWN_KEYS: Mapping[str, tuple[str, ...]] = {"theme": THEMES, "paused": ("on", "off")}
 
@@ -49,10 +50,14 @@ def read_link(query: Mapping[str, str], offers: Offers) -> PageLink:
 
 
 def usual_scene(offers: Offers) -> SceneChoice:
-    """Return what is shown unless a link says it: the first agent at both ends of what it can be told, side by side."""
+    """Return what is shown unless a link says it: the first agent twice, side by side, careful and as bold as can be.
+
+    Careful is a quarter above the lowest value that it was trained with: at the very end some agents hardly move.
+    """
     alone = SceneChoice(next(iter(offers.agents)))
     (part,) = cast(alone, offers)
     dial = part.driver.dial
     if dial is None:
         return alone
-    return SceneChoice(part.name, dial.low, second=part.name, beta2=dial.high)
+    careful = round(dial.low + _CAREFUL * (dial.high - dial.low), 2)
+    return SceneChoice(part.name, careful, second=part.name, beta2=dial.high)

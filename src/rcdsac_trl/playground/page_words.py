@@ -19,6 +19,7 @@ def refusal_words(theme: str, sentence: str) -> dict[str, Any]:
         "refused": sentence,
         "robots": [],
         "message": "",
+        "waits": False,
         "rate": "",
         "scene": "",
         "query": "",
@@ -27,14 +28,14 @@ def refusal_words(theme: str, sentence: str) -> dict[str, Any]:
 
 
 def view_words(
-    theme: str, view: View, message: str, shown_per_s: float, film: tuple[str, Sequence[str]]
+    theme: str, view: View, opening: bool, shown_per_s: float, film: tuple[str, Sequence[str]]
 ) -> dict[str, Any]:
     """Return what a page says of a view.
 
     Args:
         theme: of the page.
         view: that is shown.
-        message: a sentence for the visitor, or nothing.
+        opening: whether another scene is being made.
         shown_per_s: how many agent steps a second the browser draws.
         film: a sentence about the latest film, and the names of its files.
     """
@@ -44,7 +45,8 @@ def view_words(
         "number": view.number,
         "theme": theme,
         "refused": None,
-        "message": message,
+        "message": OPENING if opening else view.message or "",
+        "waits": opening,
         "query": choice.query,
         "scene": f"{choice.agent}{second}, {choice.map}, seed {choice.seed}",
         "rate": f"{shown_per_s:.0f} agent steps/s shown, {view.steps_per_s:.0f} driven",

@@ -33,6 +33,7 @@ _PERIOD_MS = 30
 # So many views may be under way to the browser; one that takes longer than this to be drawn is not waited for.
 _UNDER_WAY = 3
 _LONGEST_DRAWING_S = 2.0
+_REMEMBERED = 50
 _RATE_S = 4.0
 
 
@@ -59,7 +60,8 @@ class PlayPage:
         self._theme = "light"
         self._view: View | None = None
         self._said_aside: tuple[bool, tuple[str, list[str]]] = False, ("", [])
-        self._sent: dict[int, tuple[float, int]] = {}  # when, and how many steps it shows
+        # Views that the browser has not drawn yet: number, when it was sent, and how many steps it shows.
+        self._sent: deque[tuple[int, float, int]] = deque(maxlen=_REMEMBERED)
         self._drawn: deque[tuple[float, int]] = deque()
         self._keys_heard = self._steps_drawn = 0
         self._visitor = visitor = Visitor(clock)
@@ -104,11 +106,11 @@ class PlayPage:
             return
         if self._view is not None and self._aside() != self._said_aside:
             self._say(self._view)
-        self._sent = {number: sent for number, sent in self._sent.items() if now_s - sent[0] < _LONGEST_DRAWING_S}
-        if view is None or view is self._view or len(self._sent) >= _UNDER_WAY:
+        under_way = sum(now_s - sent_s < _LONGEST_DRAWING_S for _, sent_s, _ in self._sent)
+        if view is None or view is self._view or under_way >= _UNDER_WAY:
             return
         self._view = view
-        self._sent[view.number] = now_s, view.robots[0].steps
+        self._sent.append((view.number, now_s, view.robots[0].steps))
         settled = view.num_orders == clock.num_orders
         self._stage.show(view, zoomed=self._controls.zoomed, settled=settled)
         if settled:  # a choice that was refused has left the scene as it was
@@ -121,8 +123,7 @@ class PlayPage:
 
     def _say(self, view: View) -> None:
         opening, film = self._said_aside = self._aside()
-        message = OPENING if opening else view.message or ""
-        self._write(view_words(self._theme, view, message, self._rate(), film))
+        self._write(view_words(self._theme, view, opening, self._rate(), film))
 
     def _write(self, words: dict[str, Any]) -> None:
         self._wire.text = json.dumps(words)
@@ -144,18 +145,23 @@ class PlayPage:
     def _answered(self, attr: str, old: list[Any], new: list[Any]) -> None:
         """Hear what the browser says: which view it has drawn, which key was pressed."""
         number, key = [*new, None, None][:2]
-        sent = self._sent.pop(number, None)
-        if sent is not None and sent[1] != self._steps_drawn and self._view is not None:
-            # One more step of every robot was seen, however many were left out before it.
-            self._steps_drawn = sent[1]
-            now_s = time.monotonic()
-            drawn = (self._drawn[-1][1] if self._drawn else 0) + len(self._view.robots)
-            self._drawn.append((now_s, drawn))
-            while now_s - self._drawn[0][0] > _RATE_S:
-                self._drawn.popleft()
+        drawn = [self._sent.popleft() for _ in range(sum(sent <= (number or 0) for sent, *_ in self._sent))]
+        if drawn:
+            self._count_drawn(drawn[-1][2])
         if key is not None and key[1] != self._keys_heard:
             self._keys_heard = key[1]
             self._visitor.press(key[0])
+
+    def _count_drawn(self, steps: int) -> None:
+        """Count another step of every robot that was seen, however many were left out before it."""
+        if steps == self._steps_drawn or self._view is None:
+            return
+        self._steps_drawn = steps
+        now_s = time.monotonic()
+        drawn = (self._drawn[-1][1] if self._drawn else 0) + len(self._view.robots)
+        self._drawn.append((now_s, drawn))
+        while now_s - self._drawn[0][0] > _RATE_S:
+            self._drawn.popleft()
 
     def _rate(self) -> float:
         """Return how many agent steps a second the browser has drawn lately."""
