@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator
 import pytest
 from scenes_to_play import offers
 
+from rcdsac_trl.playground import drive_clock
 from rcdsac_trl.playground.drive_clock import DriveClock, View
+from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.scene_choice import SceneChoice
 
 PATIENCE_S = 120.0
@@ -29,12 +31,12 @@ def newest(clock: DriveClock) -> View:
 
 @pytest.fixture
 def clock() -> Iterator[DriveClock]:
-    ended = threading.Event()
-    clock = DriveClock(CHOICE, offers(), ended.set)
+    clock = DriveClock(CHOICE, offers())
+    clock.start()
     until(lambda: clock.newest is not None)
     yield clock
     clock.close(PATIENCE_S)
-    assert ended.is_set()
+    assert not clock.alive
 
 
 def pause(clock: DriveClock) -> View:
@@ -85,14 +87,64 @@ def test_beta_changes_the_curve_while_it_pauses(clock: DriveClock) -> None:
 
 
 def test_another_scene_is_opened_and_one_that_cannot_be_had_changes_nothing(clock: DriveClock) -> None:
-    clock.open(SceneChoice("sac-narrow", seed=3, second="dwa"))
+    clock.open(lambda choice: SceneChoice("sac-narrow", seed=3, second="dwa"))
     until(lambda: len(newest(clock).robots) == 2)
     opened = newest(clock)
     assert [robot.name for robot in opened.robots] == ["sac-narrow", "dwa"]
-    clock.open(SceneChoice("nobody"))
+    clock.open(lambda choice: SceneChoice("nobody"))
     until(lambda: newest(clock).message)
     assert newest(clock).choice == opened.choice
     assert newest(clock).scene_number == opened.scene_number
+
+
+def test_choices_made_before_a_scene_is_shown_add_up(clock: DriveClock) -> None:
+    number = pause(clock).scene_number
+    clock.tell(lambda drive: drive.set_stop_zone(True))
+    clock.open(lambda choice: choice.changed("agent", "sac-narrow"))
+    clock.open(lambda choice: choice.changed("seed", 3))
+    clock.open(SceneChoice.next_map)
+    until(lambda: newest(clock).num_orders == clock.num_orders)
+    assert newest(clock).choice == SceneChoice("sac-narrow", seed=4, stop=True)
+    assert newest(clock).scene_number <= number + 3
+    assert not clock.opening
+
+
+def test_a_choice_that_cannot_be_had_is_settled_with_a_sentence(clock: DriveClock) -> None:
+    stood = pause(clock)
+    clock.open(lambda choice: choice.changed("seed", 1.5))
+    until(lambda: newest(clock).num_orders == clock.num_orders)
+    assert str(newest(clock).message).startswith("seed=1.5 is no whole number")
+    assert newest(clock).choice == stood.choice
+
+
+def test_a_fault_in_making_a_scene_leaves_the_one_before(
+    clock: DriveClock, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pause(clock)
+
+    def vanish(choice: SceneChoice, offers: Offers) -> None:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(drive_clock, "Drive", vanish)
+    clock.open(SceneChoice.next_map)
+    until(lambda: newest(clock).message)
+    assert newest(clock).message == "this scene cannot be had (FileNotFoundError): see where the server was started"
+    assert "FileNotFoundError" in capfd.readouterr().err
+    assert newest(clock).choice.seed == 0
+    assert clock.alive
+
+
+def test_many_orders_at_once_cost_one_view(clock: DriveClock) -> None:
+    pause(clock)
+    held = threading.Event()
+    clock.tell(lambda drive: held.wait(PATIENCE_S) and None)
+    for beta in (-2.0, -1.5, -0.5):
+        clock.tell(lambda drive, beta=beta: drive.set_beta(0, beta))
+    before = newest(clock).number
+    held.set()
+    until(lambda: newest(clock).num_orders == clock.num_orders)
+    assert newest(clock).robots[0].dialled == -0.5
+    assert newest(clock).number <= before + 2
 
 
 def test_the_moments_of_a_film_are_of_all_steps(clock: DriveClock) -> None:
@@ -109,22 +161,22 @@ def test_the_moments_of_a_film_are_of_all_steps(clock: DriveClock) -> None:
 
 
 def test_a_first_scene_that_cannot_be_had_ends_it_with_a_sentence() -> None:
-    ended = threading.Event()
-    clock = DriveClock(SceneChoice("nobody"), offers(), ended.set)
-    assert ended.wait(PATIENCE_S)
+    clock = DriveClock(SceneChoice("nobody"), offers())
+    clock.start()
+    until(lambda: not clock.alive)
     assert clock.newest is None
     assert "no agent nobody is offered" in str(clock.refused)
 
 
 def test_a_fault_ends_it_with_a_sentence(capfd: pytest.CaptureFixture[str]) -> None:
-    ended = threading.Event()
-    clock = DriveClock(CHOICE, offers(), ended.set)
+    clock = DriveClock(CHOICE, offers())
+    clock.start()
 
     def fail(drive: object) -> None:
         raise ZeroDivisionError
 
     clock.tell(fail)
-    assert ended.wait(PATIENCE_S)
+    until(lambda: not clock.alive)
     assert "the drive has failed (ZeroDivisionError)" in str(clock.refused)
     assert "ZeroDivisionError" in capfd.readouterr().err
 
@@ -132,6 +184,7 @@ def test_a_fault_ends_it_with_a_sentence(capfd: pytest.CaptureFixture[str]) -> N
 def test_two_clocks_share_nothing() -> None:
     clocks = [DriveClock(CHOICE, offers()) for _ in range(2)]
     for clock in clocks:
+        clock.start()
         until(lambda clock=clock: clock.newest is not None)
         pause(clock)
     clocks[0].tell(lambda drive: drive.set_beta(0, 0.0))

@@ -230,7 +230,7 @@ def test_contacts_are_counted_when_they_begin_and_shown_where() -> None:
         ({"second": "rcdsac_cvar-narrow", "beta2": "-1"}, r"beta2=-1 is outside \[0.01, 1\]"),
         ({"agent": "sac-narrow", "beta": "-1"}, "beta=-1 means nothing to who drives"),
         ({"agent": "mppi", "beta": "-1"}, "beta=-1 means nothing to who drives"),
-        ({"map": "office", "sensor": "full"}, "the four cameras cover"),
+        ({"map": "office", "sensor": "full"}, "leave most of sensor=full dark"),
     ],
 )
 def test_a_scene_that_cannot_be_had_ends_in_a_sentence(query: dict[str, str], sentence: str) -> None:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 from PIL import Image
 from scenes_to_play import offers
 from test_drive_clock import PATIENCE_S, until
@@ -13,6 +14,7 @@ from rcdsac_trl.playground.scene_choice import SceneChoice
 
 def test_a_film_is_made_of_what_was_driven_and_found_by_its_name(tmp_path: Path) -> None:
     clock = DriveClock(SceneChoice("rcdsac_pow-narrow", second="dwa"), offers(), running=False)
+    clock.start()
     studio = FilmStudio(tmp_path / "films")
     until(lambda: clock.newest is not None)
     assert studio.told(clock) == ("", [])
@@ -34,12 +36,21 @@ def test_a_film_is_made_of_what_was_driven_and_found_by_its_name(tmp_path: Path)
 
 def test_a_film_of_nothing_is_refused_in_a_sentence(tmp_path: Path) -> None:
     clock = DriveClock(SceneChoice("dwa"), offers(), running=False)
+    clock.start()
     studio = FilmStudio(tmp_path)
     until(lambda: clock.newest is not None)
     studio.queue(clock)
     until(lambda: "no film" in studio.told(clock)[0])
     assert "film at least one step" in studio.told(clock)[0]
     clock.close(PATIENCE_S)
+
+
+def test_whatever_fails_in_filming_ends_in_a_sentence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    clock = DriveClock(SceneChoice("dwa"), offers())
+    studio = FilmStudio(tmp_path)
+    studio._make(clock, [], [], 0.12)  # a drive of no robot: there is no sheet to draw on
+    assert studio.told(clock) == ("no film (ZeroDivisionError): see where the server was started", [])
+    assert "ZeroDivisionError" in capfd.readouterr().err
 
 
 def test_a_film_of_an_earlier_server_stays(tmp_path: Path) -> None:

@@ -12,15 +12,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from bokeh.document.models import DocumentModelManager
 from scenes_to_play import offers
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
 from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.first_look import look_at_play
 from rcdsac_trl.config.play_settings import PlaySettings
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.playground import play_server
 from rcdsac_trl.playground.play_server import PlayServer, what_it_means
 
 
@@ -53,15 +56,30 @@ def status_of(server: PlayServer, origin: str | None) -> int:
     return IOLoop.current().run_sync(connect)
 
 
-def _get(server: PlayServer, path: str) -> str:
+def _get(server: PlayServer, path: str, name: str | None = None) -> str:
+    """Fetch a page, as a browser does that knows the server by some name."""
+    headers = {} if name is None else {"Host": name}
+    asked = urllib.request.Request(f"http://localhost:{server.port}{path}", headers=headers)
+
     async def fetch() -> str:
         loop = IOLoop.current()
-        return await loop.run_in_executor(None, lambda: _read(f"http://localhost:{server.port}{path}"))
+        return await loop.run_in_executor(None, lambda: _read(asked))
 
     return IOLoop.current().run_sync(fetch)
 
 
-def _read(url: str) -> str:
+def _refused(server: PlayServer, path: str, name: str | None = None) -> tuple[int, str]:
+    """Return the status of an answer, and its sentence."""
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        _get(server, path, name)
+    with refused.value as answer:
+        page = answer.read().decode()
+    told = re.search(r'<p id="sentence">(.*?)\. ?(<a|</p>)', page)
+    assert told is not None
+    return refused.value.code, told[1]
+
+
+def _read(url: str | urllib.request.Request) -> str:
     with urllib.request.urlopen(url, timeout=60) as answer:
         return str(answer.read().decode())
 
@@ -88,6 +106,56 @@ def test_only_known_origins_are_let_in(server: PlayServer, origin: str, status: 
     assert status_of(server, origin.format(port=server.port)) == status
 
 
+@pytest.mark.parametrize(
+    ("query", "sentence"),
+    [
+        ("seed=-1", "seed=-1 is no whole number"),
+        ("agent=%3Cb%3E", "no agent &lt;b&gt; is offered"),
+        ("map=" + "x" * 3000, "no map " + "x" * 100 + ".. is offered"),
+        ("sensor=eyes", "sensor=eyes does not exist"),
+        ("agent=rcdsac_pow-narrow&beta=1", "beta=1 is outside [-2, 0]"),
+        ("beta2=-1", "beta2=-1 is for a second robot"),
+        ("map=office&sensor=full&agent=sac-narrow", "the office is driven by four cameras"),
+        ("theme=pink", "theme=pink is none of light, dark"),
+        ("paused=%ff%00", "paused=\ufffd? is none of on, off"),
+        ("bokeh-session-id=x", "the link has no key bokeh-session-id"),
+    ],
+)
+def test_a_bad_link_gets_a_sentence_before_a_page_is_made(
+    server: PlayServer, monkeypatch: pytest.MonkeyPatch, query: str, sentence: str
+) -> None:
+    monkeypatch.setattr(play_server, "PlayPage", None)
+    status, told = _refused(server, f"/?{query}")
+    assert status == 400
+    assert told.startswith(sentence)
+    assert not server._server.get_sessions()
+
+
+def test_one_page_too_many_gets_a_sentence(server: PlayServer) -> None:
+    assert "static/js/bokeh.min.js" in _get(server, "/")
+    status, told = _refused(server, "/")
+    assert status == 503
+    assert told.startswith("1 pages drive already, and this server takes no more")
+
+
+@pytest.mark.parametrize("path", ["/", "/films/play-1.gif", "/static/js/bokeh.min.js"])
+def test_a_name_that_is_not_known_gets_a_sentence_with_the_remedy(server: PlayServer, path: str) -> None:
+    sentence = "this server is not known as evil.example:8000: start it with origins=[evil.example:8000]"
+    status, told = _refused(server, path, "evil.example:8000")
+    assert status == 403
+    assert told.startswith(sentence)
+
+
+def test_a_page_is_made_without_going_through_all_models_again_and_again(
+    server: PlayServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    recompute = DocumentModelManager.recompute
+    monkeypatch.setattr(DocumentModelManager, "recompute", lambda self: (seen.append(1), recompute(self))[1])
+    _get(server, "/")
+    assert 1 <= len(seen) <= 3
+
+
 @pytest.mark.parametrize("name", ["play-1.gif", "..%2Fsecret", "%2Fetc%2Fpasswd", "../secret"])
 def test_only_films_that_were_made_can_be_fetched(server: PlayServer, tmp_path: Path, name: str) -> None:
     (tmp_path / "films").mkdir()
@@ -103,16 +171,19 @@ def test_a_port_that_is_taken_is_refused(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(UserInputError, match=rf"nothing can listen on host=127.0.0.1 port={port} \(.*in use"):
+        with pytest.raises(UserInputError, match=rf"^port={port} on host=127.0.0.1 is in use: choose another one"):
             PlayServer(offers(), host="127.0.0.1", port=port, max_sessions=1, films=tmp_path)
+        with pytest.raises(UserInputError, match="is in use"):  # told before anything is loaded
+            look_at_play(compose("play", [f"port={port}", "host=127.0.0.1"]))
 
 
 def test_what_listening_elsewhere_means_is_said() -> None:
-    assert what_it_means("localhost") is None
-    assert what_it_means("127.0.0.1") is None
-    sentence = what_it_means("0.0.0.0")
+    for host in ("localhost", "127.0.0.1", "127.0.0.9", "::1"):
+        assert what_it_means(host, 5006) is None
+    sentence = what_it_means("0.0.0.0", 5006)
     assert sentence is not None
     assert "without a password" in sentence
+    assert f"http://{socket.gethostname().lower()}:5006/" in sentence
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from rcdsac_trl.config.replay_settings import ReplaySettings
 from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.deploy import find_weights
 from rcdsac_trl.deploy.recordings.open_recording import open_recording
+from rcdsac_trl.system.listening import check_can_listen
 from rcdsac_trl.system.resources import check_out, check_writable
 from rcdsac_trl.world.maps.map_source import check_maps
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -100,6 +101,7 @@ def look_at_play(cfg: DictConfig) -> None:
         UserInputError: naming what is wrong.
     """
     settings = read_config(cfg, PlaySettings)
+    check_can_listen(settings.host, settings.port)
     for run in settings.runs:
         find_agent(run)
     check_writable(Path(settings.films))

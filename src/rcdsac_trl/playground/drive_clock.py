@@ -5,7 +5,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rcdsac_trl.errors import UserInputError
@@ -22,6 +22,9 @@ SPEEDS = (0.5, 1.0, 2.0, 4.0)
 KEPT_S = 30.0
 """A film shows so much of the drive."""
 
+Change = Callable[[SceneChoice], SceneChoice]
+"""Makes another scene of one."""
+
 # Between two pictures of all actions' values passes so much time, whatever the drive's speed.
 _VALUES_PERIOD_S = 0.4
 # Who is later than this does not catch up.
@@ -36,6 +39,7 @@ class View:
         number: counts views.
         scene_number: counts scenes: with another one, walls are drawn anew.
         choice: the scene, as a link says it.
+        num_orders: so many were carried out, or refused.
         map: what stands.
         robots: one or two.
         running: whether it drives.
@@ -47,6 +51,7 @@ class View:
     number: int
     scene_number: int
     choice: SceneChoice
+    num_orders: int
     map: Map
     robots: tuple[RobotView, ...]
     running: bool
@@ -56,26 +61,28 @@ class View:
 
 
 class DriveClock:
-    """Drives a scene in a thread of its own until it is closed.
+    """Drives a scene in a thread of its own, from its start until it is closed.
 
     Args:
         choice: the first scene.
         offers: what there is to choose from.
-        ended: called, in that thread, when the physics is freed.
         running: whether it drives at once, or waits to be told so.
 
     Attributes:
         newest: the latest view; None until the first scene stands.
+        num_orders: so many were given.
         refused: why the first scene cannot be had; None: it can.
     """
 
-    def __init__(
-        self, choice: SceneChoice, offers: Offers, ended: Callable[[], None] = lambda: None, running: bool = True
-    ) -> None:
+    def __init__(self, choice: SceneChoice, offers: Offers, running: bool = True) -> None:
         self.newest: View | None = None
+        self.num_orders = 0
         self.refused: str | None = None
-        self._offers, self._ended = offers, ended
+        self._offers = offers
         self._orders: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._changes: deque[Change] = deque()
+        self._opening = False
+        self._num_done = 0
         self._running, self._speed = running, 1.0
         self._message: str | None = None
         self._scene_number = 0
@@ -86,20 +93,38 @@ class DriveClock:
         self._moments: list[deque[Moment]] = []
         self._step_times_s: deque[float] = deque(maxlen=32)
         self._thread = threading.Thread(target=self._live, args=[choice], name="drive", daemon=True)
+
+    def start(self) -> None:
+        """Make the scene, and drive it."""
         self._thread.start()
 
+    @property
+    def opening(self) -> bool:
+        """Whether another scene was asked for that does not stand yet."""
+        return self._opening or bool(self._changes)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it has started, and its physics is not freed yet."""
+        return self._thread.is_alive()
+
     # ------------------------------------------------------------------------------------------- orders
-    def open(self, choice: SceneChoice) -> None:
-        """Drive another scene; if it cannot be had, the one before goes on, and a sentence says why."""
-        self._orders.put(lambda: self._open(choice))
+    def open(self, change: Change) -> None:
+        """Drive another scene; if it cannot be had, the one before goes on, and a sentence says why.
+
+        Args:
+            change: makes it of the scene that is driven then. What is asked for meanwhile adds up.
+        """
+        self._changes.append(change)
+        self._order(self._open)
 
     def tell(self, order: Callable[[Drive], None]) -> None:
         """Do something with the drive between two steps."""
-        self._orders.put(lambda: order(self._drive))
+        self._order(lambda: order(self._drive))
 
     def run(self, on: bool) -> None:
         """Go on, or pause."""
-        self._orders.put(lambda: setattr(self, "_running", on))
+        self._order(lambda: setattr(self, "_running", on))
 
     def step_once(self) -> None:
         """Pause, and take one step."""
@@ -108,15 +133,15 @@ class DriveClock:
             self._running = False
             self._step()
 
-        self._orders.put(step)
+        self._order(step)
 
     def set_speed(self, speed: float) -> None:
         """Set how many times as fast as real it drives, one of :data:`SPEEDS`."""
-        self._orders.put(lambda: setattr(self, "_speed", speed))
+        self._order(lambda: setattr(self, "_speed", speed))
 
     def with_moments(self, take: Callable[[list[list[Moment]], list[str], float], None]) -> None:
         """Hand the moments of each robot, their names, and the duration of a step, s, to somebody."""
-        self._orders.put(lambda: take([list(track) for track in self._moments], self._headings(), self._drive.period_s))
+        self._order(lambda: take([list(track) for track in self._moments], self._headings(), self._drive.period_s))
 
     def close(self, wait_s: float | None = None) -> None:
         """End the drive and free its physics.
@@ -125,8 +150,12 @@ class DriveClock:
             wait_s: wait for that at most so long; None: do not wait.
         """
         self._orders.put(None)
-        if wait_s is not None:
+        if wait_s is not None and self.alive:
             self._thread.join(wait_s)
+
+    def _order(self, order: Callable[[], None]) -> None:
+        self.num_orders += 1
+        self._orders.put(order)
 
     # ------------------------------------------------------------------------------------------- its thread
     def _live(self, choice: SceneChoice) -> None:
@@ -141,8 +170,6 @@ class DriveClock:
         except Exception as error:  # nobody else would hear of it
             traceback.print_exc()
             self.refused = f"the drive has failed ({type(error).__name__}): see where the server was started"
-        finally:
-            self._ended()
 
     def _run(self) -> None:
         while self._serve():
@@ -153,20 +180,32 @@ class DriveClock:
     def _serve(self) -> bool:
         """Carry out orders until a step is due; return whether to go on."""
         while True:
-            wait_s = max(0.0, self._due_s - time.monotonic()) if self._running else None
-            try:
-                order = self._orders.get(timeout=wait_s) if wait_s != 0.0 else self._orders.get_nowait()
-            except queue.Empty:
+            orders = self._next_orders()
+            if not orders:
                 return True
-            if order is None:
-                return False
             self._message = None
-            try:
-                order()
-            except UserInputError as error:
-                self._message = str(error)
+            for order in orders:
+                if order is None:
+                    return False
+                try:
+                    order()
+                except UserInputError as error:
+                    self._message = str(error)
+            self._num_done += len(orders)
             self._values_s = 0.0  # beta may be another one
             self._publish()
+
+    def _next_orders(self) -> list[Callable[[], None] | None]:
+        """Return all orders that came, at least one unless a step is due first."""
+        wait_s = max(0.0, self._due_s - time.monotonic()) if self._running else None
+        try:
+            orders = [self._orders.get(timeout=wait_s)]
+        except queue.Empty:
+            return []
+        # A slider that is drawn orders faster than views are computed: one view shows what came of all.
+        while not self._orders.empty():
+            orders.append(self._orders.get())
+        return orders
 
     def _schedule(self) -> None:
         now_s = time.monotonic()
@@ -174,10 +213,31 @@ class DriveClock:
         if now_s > self._due_s + _LATEST_S:
             self._due_s = now_s
 
-    def _open(self, choice: SceneChoice) -> None:
-        drive = Drive(choice, self._offers)
-        self._drive.close()
-        self._begin(drive)
+    def _open(self) -> None:
+        self._opening = True
+        try:
+            changes = [self._changes.popleft() for _ in range(len(self._changes))]
+            if changes:  # else an earlier order has opened what they make together
+                drive = self._changed(changes)
+                self._drive.close()
+                self._begin(drive)
+        finally:
+            self._opening = False
+
+    def _changed(self, changes: Sequence[Change]) -> Drive:
+        """Make the scene that some changes make of what is driven."""
+        choice = self._drive.choice
+        try:
+            for change in changes:
+                choice = change(choice)
+            return Drive(choice, self._offers)
+        except UserInputError:
+            raise
+        except Exception as error:  # what is driven goes on
+            traceback.print_exc()
+            raise UserInputError(
+                f"this scene cannot be had ({type(error).__name__}): see where the server was started"
+            ) from error
 
     def _begin(self, drive: Drive) -> None:
         self._drive = drive
@@ -214,6 +274,7 @@ class DriveClock:
             number=1 if self.newest is None else self.newest.number + 1,
             scene_number=self._scene_number,
             choice=drive.choice,
+            num_orders=self._num_done,
             map=drive.robots[0].arena.map,
             robots=views,
             running=self._running,

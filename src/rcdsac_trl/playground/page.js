@@ -5,7 +5,9 @@ const put = (element, text) => { if (element && element.textContent !== text) el
 
 document.documentElement.dataset.theme = state.theme;
 document.body.classList.toggle("two", state.robots.length === 2);
-put(document.getElementById("message"), state.message || "");
+const message = document.getElementById("message");
+put(message, state.message);
+message.classList.toggle("waits", state.waits);
 put(document.getElementById("rate"), state.rate);
 put(document.getElementById("scene-told"), state.scene);
 const sentence = document.getElementById("sentence");
@@ -13,7 +15,7 @@ sentence.hidden = !state.refused;
 for (const id of ["bar", "scene", "stage"]) document.getElementById(id).hidden = Boolean(state.refused);
 document.querySelector("footer").hidden = Boolean(state.refused);
 if (state.refused && !sentence.textContent) {
-  sentence.textContent = state.refused + " ";
+  sentence.textContent = state.refused + ". ";
   const link = document.createElement("a");
   link.href = window.location.pathname;
   link.textContent = "Open the usual scene.";

@@ -5,23 +5,18 @@ Nothing here knows of a browser: it is stepped, and told what to do.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rcdsac_trl.deploy import Command
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.evaluation.course.entries import check_sensor
 from rcdsac_trl.playground.arenas import MOST_OBSTACLES, Arena, CourseArena, MapArena
-from rcdsac_trl.playground.drivers import AgentDriver, Driver, PlannerDriver
-from rcdsac_trl.playground.offers import OFFICE, PLANNERS, Offers
-from rcdsac_trl.playground.scene_choice import AS_TRAINED, NOBODY, SceneChoice, shortened
-from rcdsac_trl.robot.range_sensor import SENSORS
-from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.playground.cast import cast
+from rcdsac_trl.playground.drivers import AgentDriver, Driver
+from rcdsac_trl.playground.offers import OFFICE, Offers
+from rcdsac_trl.playground.scene_choice import SceneChoice
 from rcdsac_trl.world.office.building import make_office
-from rcdsac_trl.world.office.depth_cameras import Lens
 from rcdsac_trl.world.task.rules import TaskSettings
 
-NARROW = "narrow"
-"""The sensor of planners, and of the office's cameras."""
 TRAIL_STEPS = 400
 """So many steps of its way are kept of a robot."""
 
@@ -98,23 +93,19 @@ class Drive:
         num_obstacles: that were put.
 
     Raises:
-        UserInputError: for what is not offered, a beta outside of the trained range, a sensor that does not exist, and
-            two robots that do not fit the same map.
+        UserInputError: if :func:`~rcdsac_trl.playground.cast.cast` refuses the scene, or its map cannot be made.
     """
 
     def __init__(self, choice: SceneChoice, offers: Offers) -> None:
         self.choice = choice
         self.num_obstacles = 0
-        names = [choice.agent] + ([] if choice.second == NOBODY else [choice.second])
-        drivers = _drivers(names, choice, offers)
-        betas = [("beta", choice.beta), ("beta2", choice.beta2)]
-        dialled = [_dialled(driver, *beta) for driver, beta in zip(drivers, betas, strict=False)]
+        parts = cast(choice, offers)
         self.robots: list[Robot] = []
         try:
-            for name, driver, value in zip(names, drivers, dialled, strict=True):
-                driver.guarded = choice.stop
-                self.robots.append(Robot(name, driver, _arena(choice, driver, offers), value))
-            self.choice = choice.with_betas(dialled)
+            for part in parts:
+                arena = _arena(choice, part.driver, offers)
+                self.robots.append(Robot(part.name, part.driver, arena, part.dialled))
+            self.choice = choice.with_betas([part.dialled for part in parts])
         except BaseException:
             self.close()
             raise
@@ -149,6 +140,7 @@ class Drive:
         """Put a stop zone between all drivers and their wheels, or take it away."""
         for robot in self.robots:
             robot.driver.guarded = on
+        self.choice = replace(self.choice, stop=on)
 
     def set_goal(self, x: float, y: float) -> None:
         """Send all robots to the place nearest to a point, m, that they can get to."""
@@ -192,48 +184,8 @@ class Drive:
             act(robot.arena)
 
 
-def _drivers(names: list[str], choice: SceneChoice, offers: Offers) -> list[Driver]:
-    """Make who drives; a planner drives the robot, and sees with the sensor, of the agent beside it."""
-    if choice.map not in offers.places:
-        offers.source(choice.map)  # says so
-    if choice.sensor != AS_TRAINED and choice.sensor not in SENSORS:
-        known = ", ".join([AS_TRAINED, *sorted(SENSORS)])
-        raise UserInputError(f"sensor={shortened(choice.sensor)} does not exist: choose one of {known}")
-    sensor = None if choice.sensor == AS_TRAINED else choice.sensor
-    agents = {name: AgentDriver(offers.weights(name), sensor) for name in dict.fromkeys(names) if name not in PLANNERS}
-    first = next(iter(agents.values()), None)
-    robot: RobotSettings = PAPER if first is None else first.robot
-    beside = sensor or (NARROW if first is None else first.sensor)
-    drivers: list[Driver] = []
-    for name in names:
-        if name in PLANNERS:
-            drivers.append(PlannerDriver(name, robot, beside, choice.seed))
-        elif name in names[: len(drivers)]:  # the same agent twice has two memories
-            drivers.append(AgentDriver(offers.weights(name), sensor))
-        else:
-            drivers.append(agents[name])
-    for name, driver in zip(names, drivers, strict=True):
-        if driver.robot != robot:
-            raise UserInputError(
-                f"{name} drives robot={driver.robot.name} and {names[0]} robot={robot.name}: choose two of one robot"
-            )
-    return drivers
-
-
-def _dialled(driver: Driver, key: str, value: float | None) -> float | None:
-    if driver.dial is not None:
-        return driver.dial.check(key, value)
-    if value is not None and value != getattr(driver, "fixed_beta", None):
-        raise UserInputError(f"{key}={value:g} means nothing to who drives: leave it out")
-    return None
-
-
 def _arena(choice: SceneChoice, driver: Driver, offers: Offers) -> Arena:
     if choice.map != OFFICE:
         return MapArena(offers.source(choice.map), choice.seed, driver.robot, driver.sensor, driver.memory_s)
-    if driver.robot != PAPER:
-        raise UserInputError(f"the office is the paper's robot's, and this one is {driver.robot.name}: choose a map")
-    if isinstance(driver, AgentDriver):
-        check_sensor(choice.agent, driver.policy, Lens().view_deg)
-        return CourseArena(make_office(), driver.policy.config, choice.seed)
-    return CourseArena(make_office(), TaskSettings(), choice.seed)
+    config = driver.policy.config if isinstance(driver, AgentDriver) else TaskSettings()
+    return CourseArena(make_office(), config, choice.seed)

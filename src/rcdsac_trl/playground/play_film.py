@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+import traceback
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -70,6 +71,10 @@ class FilmStudio:
                 files = write_video(film(named, period_s), stem, 1.0 / period_s)
             except (UserInputError, FaultError, OSError) as error:
                 self._tell(clock, f"no film: {error}")
+                return
+            except Exception as error:  # nobody else would hear of it
+                traceback.print_exc()
+                self._tell(clock, f"no film ({type(error).__name__}): see where the server was started")
                 return
             self._made |= {file.name: file for file in files}
             self._tell(clock, f"{self._folder}:", [file.name for file in files])

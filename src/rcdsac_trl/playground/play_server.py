@@ -5,8 +5,9 @@ import queue
 import socket
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from ipaddress import ip_address
 from pathlib import Path
 
 from bokeh.application import Application
@@ -20,15 +21,21 @@ from tornado.ioloop import IOLoop
 from tornado.web import HTTPError, RequestHandler
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.playground.drive_clock import DriveClock
+from rcdsac_trl.playground.gate import TooManyPages, guarded, query_of
 from rcdsac_trl.playground.offers import Offers
+from rcdsac_trl.playground.page_link import PageLink, read_link
 from rcdsac_trl.playground.play_film import FilmStudio
 from rcdsac_trl.playground.play_page import PlayPage
+from rcdsac_trl.system.listening import cannot_listen, check_can_listen
 
-LOOPBACK = ("localhost", "127.0.0.1")
+_LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
+_ALL_ADDRESSES = ("0.0.0.0", "::")
 # A page that nobody looks at any more ends after this.
 _UNUSED_MS = 15_000
 _CHECK_UNUSED_MS = 1000
 _LARGEST_MESSAGE_BYTES = 1_000_000
+_PATH = "/"
 
 
 class PlayServer:
@@ -55,39 +62,34 @@ class PlayServer:
         self._offers, self._host, self._max_sessions = offers, host, max_sessions
         self._studio = FilmStudio(films)
         self._pages: list[PlayPage] = []
-        self._driving = 0
-        self._lock = threading.Lock()
+        self._clocks: list[DriveClock] = []
+        check_can_listen(host, port)  # Tornado leaves sockets open that it could not bind
         try:
-            if port:  # Tornado leaves sockets open that it could not bind
-                family = socket.AF_INET6 if ":" in host else socket.AF_INET
-                socket.create_server((host, port), family=family).close()
             sockets, self.port = bind_sockets(host, port)
         except OSError as error:
-            raise UserInputError(
-                f"nothing can listen on host={host} port={port} ({error.strerror}): choose another one, port=0 for any"
-            ) from None
-        names = LOOPBACK if host in LOOPBACK else (host,)
+            raise cannot_listen(host, port, error) from None
+        known = [f"{name}:{self.port}" for name in names_of(host)] + [origin.lower() for origin in origins]
         pages = BokehTornado(
-            {"/": Application(FunctionHandler(self._make_page))},
-            extra_websocket_origins=[*(f"{name}:{self.port}" for name in names), *origins],
+            {_PATH: Application(FunctionHandler(self._make_page))},
+            extra_websocket_origins=known,
             extra_patterns=[(r"/films/([^/]+)", _FilmHandler, {"studio": self._studio})],
             unused_session_lifetime_milliseconds=_UNUSED_MS,
             check_unused_sessions_milliseconds=_CHECK_UNUSED_MS,
             websocket_max_message_size_bytes=_LARGEST_MESSAGE_BYTES,
         )
-        self._http = HTTPServer(pages)
+        self._http = HTTPServer(guarded(pages, known, self._check))
         self._http.add_sockets(sockets)
         self._server = BaseServer(IOLoop.current(), pages, self._http)
 
     @property
     def address(self) -> str:
         """Where a browser finds it."""
-        return f"http://{self._host}:{self.port}/"
+        return f"http://{names_of(self._host)[0]}:{self.port}/"
 
     @property
     def num_drives(self) -> int:
         """How many robots, or pairs of them, drive now."""
-        return self._driving
+        return sum(clock.alive for clock in self._clocks)
 
     def start(self) -> None:
         """Answer whoever asks, while the thread's event loop runs."""
@@ -120,30 +122,40 @@ class PlayServer:
     def _make_page(self, document: Document) -> None:
         context = document.session_context
         assert context is not None
-        query = {
-            key: values[-1].decode(errors="replace") for key, values in context.request.arguments.items() if values
-        }
-        page = PlayPage(document, query, self._offers, self._studio, self._admit, self._leave)
+        query = query_of(context.request.arguments)
+        try:
+            link = self._check(query)
+        except UserInputError:  # the gate has said so to who came through it
+            return
+        clock = DriveClock(link.choice, self._offers, running=link.running)
+        self._clocks = [*(clock for clock in self._clocks if clock.alive), clock]
+        page = PlayPage(document, clock, link.theme, self._offers, self._studio)
         self._pages.append(page)
-        document.on_session_destroyed(lambda context: self._pages.remove(page))
+        document.on_session_destroyed(lambda context: self._forget(page))
 
-    def _admit(self) -> None:
-        """Count another drive.
+    def _forget(self, page: PlayPage) -> None:
+        if page in self._pages:
+            self._pages.remove(page)
+
+    def _check(self, query: Mapping[str, str]) -> PageLink:
+        """Read a link, and see whether there is room for its page: where there is none, who has left makes room.
 
         Raises:
-            UserInputError: if there are too many.
+            UserInputError: for a bad link, and if there are too many pages.
         """
-        with self._lock:
-            if self._driving >= self._max_sessions:
-                raise UserInputError(
-                    f"{self._driving} pages drive already, and this server takes no more: close one of them, or start "
-                    "the server with a larger max_sessions"
-                )
-            self._driving += 1
-
-    def _leave(self) -> None:
-        with self._lock:
-            self._driving -= 1
+        link = read_link(query, self._offers)
+        if len(self._pages) < self._max_sessions:
+            return link
+        watched = [session.document for session in self._server.get_sessions(_PATH) if session.connection_count]
+        for page in [page for page in self._pages if page.begun and page.document not in watched]:
+            page.close()
+            self._forget(page)
+        if len(self._pages) >= self._max_sessions:
+            raise TooManyPages(
+                f"{len(self._pages)} pages drive already, and this server takes no more: close one of them, or start "
+                "the server with a larger max_sessions"
+            )
+        return link
 
 
 @contextmanager
@@ -202,11 +214,34 @@ class _FilmHandler(RequestHandler):
         self.write(path.read_bytes())
 
 
-def what_it_means(host: str) -> str | None:
+def names_of(host: str) -> Sequence[str]:
+    """Return the names under which browsers come to who listens on a host; those of the loopback are one another's.
+
+    Example:
+        >>> names_of("192.168.0.7")
+        ('192.168.0.7',)
+    """
+    if is_loopback(host):
+        return _LOOPBACK_NAMES
+    if host in _ALL_ADDRESSES:
+        return (*_LOOPBACK_NAMES, socket.gethostname().lower())
+    return (f"[{host}]" if ":" in host else host.lower(),)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches a host."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def what_it_means(host: str, port: int) -> str | None:
     """Return what follows of listening on a host; None for the loopback, which only this machine reaches."""
-    if host in LOOPBACK:
+    if is_loopback(host):
         return None
     return (
-        f"host={host}: whoever reaches this machine there can open pages, without a password. They can drive what is "
-        "offered, which takes processor time, and fetch films that were saved; no file is read by a path of theirs"
+        f"host={host}: whoever reaches this machine there can open pages, without a password, as "
+        f"http://{names_of(host)[-1]}:{port}/ or by another name that is in origins. They can drive what is offered, "
+        "which takes processor time, and fetch films that were saved; no file is read by a path of theirs"
     )

@@ -9,7 +9,7 @@ from rcdsac_trl.config.named_world import generated_sets, map_set
 from rcdsac_trl.config.play_settings import PlaySettings
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.playground.offers import Offers
-from rcdsac_trl.playground.play_server import LOOPBACK, PlayServer, what_it_means
+from rcdsac_trl.playground.play_server import PlayServer, is_loopback, what_it_means
 from rcdsac_trl.system.progress import serving
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 
@@ -26,10 +26,10 @@ class PlaySession:
         settings = self.settings
         server = serve(self.offers, settings)
         print(f"{server.address} drives {', '.join(self.offers.drivers)}; Ctrl-C ends it")
-        if (warning := what_it_means(settings.host)) is not None:
+        if (warning := what_it_means(settings.host, server.port)) is not None:
             print(warning)
         with serving():
-            server.run(browser=settings.browser and settings.host in LOOPBACK)
+            server.run(browser=settings.browser and is_loopback(settings.host))
 
 
 def make_session(cfg: DictConfig) -> PlaySession:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 from urllib.parse import urlencode
 
 from rcdsac_trl.errors import UserInputError
@@ -51,8 +52,8 @@ class SceneChoice:
 
     def __post_init__(self) -> None:
         """Refuse what is no seed."""
-        if not 0 <= self.seed <= LARGEST_SEED:
-            raise UserInputError(f"seed={self.seed} is outside [0, {LARGEST_SEED}]: give a whole number of that range")
+        if not isinstance(self.seed, int) or not 0 <= self.seed <= LARGEST_SEED:
+            raise _no_seed(f"={self.seed}")
 
     @classmethod
     def of_query(cls, query: Mapping[str, str], agent: str = "") -> "SceneChoice":
@@ -80,13 +81,40 @@ class SceneChoice:
         told = {field.name: getattr(self, field.name) for field in fields(self)}
         return urlencode({key: _written(value) for key, value in told.items() if value != getattr(usual, key)})
 
+    def changed(self, key: str, value: Any) -> "SceneChoice":
+        """Return the scene with another value of a field, as a form gives it; betas go with whom they belong to.
+
+        Args:
+            key: of the field.
+            value: that it has now; None: its field is empty.
+
+        Raises:
+            UserInputError: for a seed that is none.
+
+        Example:
+            >>> SceneChoice("a", beta=-1.0, second="b").changed("agent", "b").changed("seed", 3.0).query
+            'agent=b&seed=3&second=b'
+        """
+        if key == "seed":
+            if value is None:
+                raise _no_seed(" is empty, which")
+            value = int(value) if isinstance(value, float) and value.is_integer() else value
+        lost = {"agent": {"beta": None}, "second": {"beta2": None}}
+        changes: dict[str, Any] = {key: value, **lost.get(key, {})}
+        return replace(self, **changes)
+
+    def next_map(self) -> "SceneChoice":
+        """Return the scene with the next seed; after the largest comes 0."""
+        return replace(self, seed=(self.seed + 1) % (LARGEST_SEED + 1))
+
     def with_betas(self, betas: Sequence[float | None]) -> "SceneChoice":
         """Return the scene with other betas, one or two."""
         return replace(self, beta=betas[0], beta2=betas[1] if len(betas) > 1 else None)
 
 
 def shortened(text: str) -> str:
-    """Return what somebody wrote, not longer than a sentence can bear."""
+    """Return what somebody wrote, as a sentence can bear it."""
+    text = "".join(letter if letter.isprintable() else "?" for letter in text[: _LONGEST_VALUE + 1])
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}.."
 
 
@@ -101,13 +129,17 @@ def _read(key: str, text: str) -> str | float | int | bool:
         return value
     if key == "seed":
         if not (text.isascii() and text.isdigit() and len(text) <= len(str(LARGEST_SEED))):
-            raise UserInputError(f"seed={shortened(text)} is no whole number from 0 to {LARGEST_SEED}: give one")
+            raise _no_seed(f"={shortened(text)}" if text else " is empty, which")
         return int(text)
     if key == "stop":
         if text not in _SWITCHES:
             raise UserInputError(f"stop={shortened(text)} is neither on nor off: choose one of them")
         return _SWITCHES[text]
     return text
+
+
+def _no_seed(told: str) -> UserInputError:
+    return UserInputError(f"seed{told} is no whole number from 0 to {LARGEST_SEED}: give one")
 
 
 def _written(value: str | float | int | bool | None) -> str:

@@ -1,0 +1,63 @@
+"""A page's link, read and checked before anything of the page is made."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.playground.cast import cast
+from rcdsac_trl.playground.offers import Offers
+from rcdsac_trl.playground.palette import THEMES
+from rcdsac_trl.playground.scene_choice import SceneChoice, shortened
+
+_CAREFUL = 0.25
+# What a link may say of the page itself.
+_OWN_KEYS: Mapping[str, tuple[str, ...]] = {"theme": THEMES, "paused": ("on", "off")}
+
+
+@dataclass(frozen=True)
+class PageLink:
+    """What a link asks for.
+
+    Attributes:
+        choice: the scene.
+        theme: one of :data:`~rcdsac_trl.playground.palette.THEMES`; None: as the browser has it.
+        running: whether it drives at once.
+    """
+
+    choice: SceneChoice
+    theme: str | None
+    running: bool
+
+
+def read_link(query: Mapping[str, str], offers: Offers) -> PageLink:
+    """Read a link's query.
+
+    Args:
+        query: by key: those of a scene, ``theme`` and ``paused``.
+        offers: what can be chosen.
+
+    Raises:
+        UserInputError: for what it cannot say, and for a scene that is not offered.
+    """
+    own = {key: query[key] for key in _OWN_KEYS if key in query}
+    for key, value in own.items():
+        if value not in _OWN_KEYS[key]:
+            raise UserInputError(f"{key}={shortened(value)} is none of {', '.join(_OWN_KEYS[key])}: choose one of them")
+    scene = {key: value for key, value in query.items() if key not in own}
+    choice = SceneChoice.of_query(scene, next(iter(offers.agents))) if scene else usual_scene(offers)
+    cast(choice, offers)
+    return PageLink(choice, own.get("theme"), own.get("paused") != "on")
+
+
+def usual_scene(offers: Offers) -> SceneChoice:
+    """Return what is shown unless a link says it: the first agent twice, side by side, careful and as bold as can be.
+
+    Careful is a quarter above the lowest value that it was trained with: at the very end some agents hardly move.
+    """
+    alone = SceneChoice(next(iter(offers.agents)))
+    (part,) = cast(alone, offers)
+    dial = part.driver.dial
+    if dial is None:
+        return alone
+    careful = round(dial.low + _CAREFUL * (dial.high - dial.low), 2)
+    return SceneChoice(part.name, careful, second=part.name, beta2=dial.high)

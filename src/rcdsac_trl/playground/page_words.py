@@ -1,0 +1,83 @@
+"""What page.js writes on the page: numbers with their units, sentences, the link."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from rcdsac_trl.playground.drive_clock import View
+from rcdsac_trl.playground.scene_choice import NOBODY
+from rcdsac_trl.playground.view_state import RobotView
+
+OPENING = "Making the scene .."
+"""Said until it stands."""
+
+
+def refusal_words(theme: str, sentence: str) -> dict[str, Any]:
+    """Return what a page says that shows nothing but a sentence."""
+    return {
+        "number": 0,
+        "theme": theme,
+        "refused": sentence,
+        "robots": [],
+        "message": "",
+        "waits": False,
+        "rate": "",
+        "scene": "",
+        "query": "",
+        "film": {"told": "", "files": []},
+    }
+
+
+def view_words(
+    theme: str, view: View, opening: bool, shown_per_s: float, film: tuple[str, Sequence[str]]
+) -> dict[str, Any]:
+    """Return what a page says of a view.
+
+    Args:
+        theme: of the page.
+        view: that is shown.
+        opening: whether another scene is being made.
+        shown_per_s: how many agent steps a second the browser draws.
+        film: a sentence about the latest film, and the names of its files.
+    """
+    choice = view.choice
+    second = "" if choice.second == NOBODY else f" beside {choice.second}"
+    return {
+        "number": view.number,
+        "theme": theme,
+        "refused": None,
+        "message": OPENING if opening else view.message or "",
+        "waits": opening,
+        "query": choice.query,
+        "scene": f"{choice.agent}{second}, {choice.map}, seed {choice.seed}",
+        "rate": f"{shown_per_s:.0f} agent steps/s shown, {view.steps_per_s:.0f} driven",
+        "film": {"told": film[0], "files": list(film[1])},
+        "robots": [_robot_words(robot) for robot in view.robots],
+    }
+
+
+def _robot_words(robot: RobotView) -> dict[str, Any]:
+    beta = "" if robot.dial is None else f"{robot.dial.symbol} = {robot.dialled:.2f}"
+    returns = robot.returns
+    value = "" if returns is None else f"mean {returns.mean:.1f} (dotted), at this β {returns.value:.1f} (dashed)"
+    nothing = ""
+    if robot.values is None and robot.wanted is not None:
+        nothing = "A planner: it expects no return."
+    elif returns is None and robot.wanted is not None:
+        nothing = "Its critics know the mean return alone, no distribution."
+    limited = "" if robot.limited is None else f"held by {robot.limited.removeprefix('limited by ').split(';')[0]}"
+    return {
+        "name": robot.name,
+        "beta": beta,
+        "limited": limited,
+        "speed": f"{robot.speed_m_per_s + 0.0:.2f} m/s",
+        "clearance": f"{robot.clearance_m:.2f} m",
+        "reward": "–" if robot.reward is None else f"{robot.reward:.1f}",
+        "time": f"{robot.time_s:.1f} s",
+        "goals": str(robot.goals),
+        "collisions": str(robot.collisions),
+        "value": value,
+        "nothing": nothing,
+        "blind": returns is None,
+        "deaf": robot.values is None,
+        "touching": robot.in_contact,
+    }
