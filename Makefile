@@ -57,9 +57,9 @@ docs: setup ## build the documentation as a site: build/docs/html/index.html
 	$(BIN)/python -m sphinx -E -W --keep-going -q -d build/docs/doctrees docs build/docs/html
 	@echo "Open build/docs/html/index.html in a browser."
 
-pictures: setup ## draw the pictures of docs/images anew, each as CONTRIBUTING.md says; with the film of the page, half an hour
+pictures: setup ## draw the pictures of docs/images anew that need no measurement: some minutes, and Chromium
 	$(BIN)/python -m rcdsac_trl.draw_maps split=validation count=4 out=docs/images/maps.png
-	for name in sensor_pictures results_figures ways play_film; do $(BIN)/python docs/images/$$name.py || exit 1; done
+	for name in sensor_pictures learning_study results_figures ways play_film; do $(BIN)/python docs/images/$$name.py || exit 1; done
 
 format: setup ## let ruff repair what it can
 	$(BIN)/ruff check --fix .

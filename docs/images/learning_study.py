@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.figures import learning_curves
 
 RESULTS = Path(__file__).parents[2] / "results"
@@ -23,5 +24,7 @@ for name, (seconds, folders) in RUNS.items():
     done = (rows["iteration"] // TOGETHER + 1) * TOGETHER
     curves[name] = rows.assign(updates=UPDATES_PER_ITERATION * done, elapsed_s=seconds * done)
 figure = learning_curves(curves)
-figure.suptitle("Training episodes, with exploration, at every β; both seeds", x=0.01, ha="left", fontsize=13)
+figure.suptitle(
+    "Training episodes, with exploration, at every β; both seeds", x=0.01, ha="left", fontsize=13, color=LIGHT.ink
+)
 figure.savefig(Path(__file__).with_suffix(".png"), dpi=130)

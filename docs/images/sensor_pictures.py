@@ -78,7 +78,7 @@ def main() -> None:
         (heading, dataclasses.replace(moment, sensor_mask=sensor_mask(name))) for name, heading in SENSORS.items()
     ]
     sheet(panels, SIDE_PX, ("robot", "seen", "hit", "trail", "way", *THINGS)).save(HERE / "sensors.png", optimize=True)
-    names = ("robot", "seen", "hit", "remembered", "trail", "way", *THINGS, "mover")
+    names = ("robot", "seen", "hit", "remembered", "trail", "way", "wall", "mapped", "mover")
     sheet([("", remembering())], LARGE_SIDE_PX, names).save(HERE / "remembered.png", optimize=True)
 
 
