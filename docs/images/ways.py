@@ -31,6 +31,8 @@ def spec_of(name: str) -> tuple[EvaluationSpec, Agent]:
     named = named_agent(name)
     trained = named.settings
     conditions = trained.algo.conditions(None, None)
+    if len({condition.beta for condition in conditions}) < 2:
+        raise SystemExit(f"{name} is not driven at two betas: name an agent that is risk-conditioned")
     world = WorldSettings(
         map_settings=trained.map,
         task=trained.task,
