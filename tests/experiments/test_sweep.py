@@ -68,7 +68,7 @@ def test_the_table_is_the_papers_twenty_runs(monkeypatch: pytest.MonkeyPatch, tm
         ("rcwr",),
         ("sac",),
     ]
-    asked = ("split=evaluation", "num_maps=50", "num_episodes=10")
+    asked = ("checkpoint=last", "half_precision=true", "split=evaluation", "num_maps=50", "num_episodes=10")
     assert made["rcdsac_cvar-narrow-s0"].evaluate == ("beta=[0.25,0.5,0.75,1]", *asked)
     assert made["dsac_pow_-2-sparse-s0"].evaluate == asked
 
@@ -98,7 +98,7 @@ def test_the_command_line_narrows_an_experiment() -> None:
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        (["+experiment=tabel"], "experiment=tabel does not exist: choose one of grid, study, table, weights"),
+        (["+experiment=tabel"], "experiment=tabel does not exist: choose one of grid, study, table"),
         (["+algo=sac", "launcher=cloud"], "launcher=cloud does not exist: choose one of "),
         (["+experiment=table", "experiment.only=[ppo]"], "experiment.only=ppo is no run of the experiment: choose am"),
         (["+algo=sac", "experiment.only=[ppo]"], "experiment.only=ppo is no run of the experiment: choose among none"),
