@@ -85,6 +85,8 @@ def test_tables_of_agents_are_what_was_measured() -> None:
     collisions = first["collisions"]
     assert f"| SAC | {collisions['mean']:.2f} [{collisions['low']:.2f}, {collisions['high']:.2f}] | " in readme
     assert tables["renewed"](readme.replace("| SAC | ", "| SAC | 9")) == readme
+    measured = tables["accelerator_table"]({"device": "cuda", "laptop": {"plain_updates_per_second": 123.456}})
+    assert measured.splitlines()[-1] == "| laptop | plain updates per second | 123.5 |"
 
 
 def commands() -> list[tuple[str, str]]:

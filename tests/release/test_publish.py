@@ -70,7 +70,7 @@ def test_what_is_published_drives_and_is_reported_on(
     # The card's numbers are the evaluation's.
     card = (folder / "README.md").read_text()
     mean = episodes.table.loc[episodes.table["beta"] == -2.0, "collisions"].mean()
-    (line,) = [line for line in card.splitlines() if "β = -2" in line]
+    line = next(line for line in card.splitlines() if "β = -2" in line)
     assert f"| {mean:.2f} [" in line
     assert "\n\n## Limits\n\n" in card
     assert "\n\n\n" not in card
@@ -105,7 +105,7 @@ def test_what_was_measured_is_there_for_programs(evaluated: Path, tmp_path: Path
 
 # ------------------------------------------------------------------------------------------------ as it ships
 def test_an_agent_that_was_measured_as_it_ships_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And keeps its promise: on the card's own maps it does exactly what the card says, elsewhere nearly."""
+    """And keeps its promise: on the card's own maps it does exactly what the card says."""
     run, _, _ = untrained_run(tmp_path / "run", "sac")
     evaluate(f"run={run}", "checkpoint=last", "num_episodes=3")
     shipped = evaluate(f"run={run}", "checkpoint=last", "half_precision=true", "num_maps=5", "num_episodes=1")
@@ -147,8 +147,8 @@ def test_an_evaluation_of_other_weights_is_not_quoted(tmp_path: Path) -> None:
     (shipped / "evaluation.json").write_text(json.dumps(described | {"weights_sha256": "0" * 64}))
     with pytest.raises(UserInputError, match=r"\(1 are of other weights: it was trained on\): .* half_precision=true$"):
         publish(run, tmp_path)
-    for named in ("sampled=true", "navigation.replan=true"):
-        evaluate(f"run={run}", "checkpoint=last", named, f"out={run}/evaluation/{named.partition('.')[0]}")
+    for number, helped in enumerate(("sampled=true", "navigation.replan=true")):
+        evaluate(f"run={run}", "checkpoint=last", helped, f"out={run}/evaluation/{number}")
     with pytest.raises(UserInputError, match="no evaluation of its checkpoint last"):
         publish(run, tmp_path)
     assert not (tmp_path / "weights").exists()
