@@ -59,7 +59,9 @@ def model_card(config: AgentConfig, num_parameters: int, measured: Measured | No
         told += f"; it was trained for beta = {config.fixed_beta:g} alone"
     origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items() if value is not None)
     remembered = f", what it saw in the last {config.memory_s:g} s" if config.memory_s > 0.0 else ""
-    limits = limits_of(config) if measured is None else measured.limits
+    driving = "" if measured is None else f"\n{driving_section(measured)}\n"
+    sentences = limits_of(config) if measured is None else measured.limits
+    limits = "\n".join(f"- {sentence}" for sentence in sentences)
     return f"""# {config.name}, {config.sensor} sensor
 
 A navigation agent of rcdsac_trl: recurrent actor and {config.num_critics}
@@ -80,10 +82,10 @@ policy = rcdsac_trl.load("this/folder")
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |
 | gives | linear velocity in m/s, angular velocity in rad/s |
 {origin}
-{"" if measured is None else chr(10) + driving_section(measured) + chr(10)}
+{driving}
 ## Limits
 
-{chr(10).join(f"- {sentence}" for sentence in limits)}
+{limits}
 """
 
 
