@@ -91,10 +91,11 @@ def largest_difference(device: str) -> float:
     overrides = ["preset=laptop", *small("learner", device)]
     here, there = make_learner(ROW, overrides), make_learner(ROW, overrides, device)
     batch = prepared(here)
+    for learner in (here, there):
+        learner.loss._generator = torch_stream(0, "loss")  # drawn on the CPU and brought to the batch
+    there.loss.load_state_dict(here.loss.state_dict())
     found = []
     for learner, place in ((here, "cpu"), (there, device)):
-        learner.loss.load_state_dict(here.loss.state_dict())
-        learner.loss._generator = torch_stream(0, "loss")  # drawn on the CPU and brought to the batch
         with only_layers(learner is there):
             losses = total(learner.loss(batch.to(place)))
             losses.backward()
@@ -198,7 +199,7 @@ def graphed(learner: Any) -> Callable[[], Any]:
 
     for group in learner.optimizer.param_groups:
         group["capturable"] = True
-    static = prepared(learner).clone()
+    static = prepared(learner).apply(held)
 
     def learn() -> None:
         total(learner.loss(static)).backward()
@@ -217,12 +218,25 @@ def graphed(learner: Any) -> Callable[[], Any]:
         learn()
 
     def update() -> None:
-        static.update_(prepared(learner))
+        refill(static, prepared(learner))
         graph.replay()
         learner.targets.step()
         learner.average.update_parameters(learner.loss.actor_network)
 
     return update
+
+
+def held(value: Any) -> Any:
+    """Copy a tensor; what is repeated along its sequences stays so, for the loss tells a shared beta by its stride."""
+    return value[:, :1].clone().expand_as(value) if value.stride(1) == 0 else value.clone()
+
+
+def refill(static: Any, batch: Any) -> None:
+    """Put a batch in the place of another, whose tensors stay where they are."""
+    for key, value in batch.items(True, True):
+        target = static.get(key)
+        shared = target.stride(1) == 0
+        (target[:, :1] if shared else target).copy_(value[:, :1] if shared else value)
 
 
 def collection(device: str) -> Lines:

@@ -131,6 +131,20 @@ def test_accelerator(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_graph_s_batch_is_filled_again_where_it_lies(load: Any) -> None:
+    program = load("accelerator")
+    learner = load("bench_common").make_learner("rcdsac_pow", SMALL)
+    first, second = program.prepared(learner), program.prepared(learner)
+    static = first.apply(program.held)
+    assert first["risk"].stride(1) == static["risk"].stride(1) == 0
+    places = {key: value.data_ptr() for key, value in static.items(True, True)}
+    assert (static == first).all()
+    assert not (first == second).all()
+    program.refill(static, second)
+    assert (static == second).all()
+    assert {key: value.data_ptr() for key, value in static.items(True, True)} == places
+
+
 def test_a_wrong_gradient_is_told(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     program = load("accelerator")
     total = program.total

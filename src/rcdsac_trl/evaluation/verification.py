@@ -61,6 +61,7 @@ class Verification:
         Raises:
             FaultError: if a number of a card does not hold.
         """
+        print(f"weights as their SHA-256 says: {', '.join(claim.name for claim in self.claims)}")
         for claim in self.claims:
             claim.evaluation.measure_and_write()
         text, table, refuted = describe([(c.name, c.card, c.evaluation.results.path) for c in self.claims])
