@@ -121,7 +121,7 @@ def checked_weights(folder: Path, digest: str) -> bytes:
         raise UserInputError(f"{folder} holds no {WEIGHTS_NAME} that can be read: export the agent anew") from error
     if sha256(content).hexdigest() != digest:
         raise UserInputError(
-            f"{folder / WEIGHTS_NAME} is not what {CONFIG_NAME} says it is: get the folder again, or export the agent anew"
+            f"{folder / WEIGHTS_NAME} is not what {CONFIG_NAME} says it is: get the folder again, or export it anew"
         )
     return content
 
