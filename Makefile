@@ -13,7 +13,7 @@ BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job 
 WORKERS ?= logical
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks pictures docs clean
+.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks pictures tables docs clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F '|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -52,6 +52,9 @@ check: setup ## look for mistakes of style and types
 
 notebooks: setup ## run the notebooks anew, in place
 	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
+
+tables: setup ## write the tables of agents in README.md and docs/ anew, from weights/ and results/
+	$(BIN)/python docs/tables.py
 
 docs: setup ## build the documentation as a site: build/docs/html/index.html
 	$(BIN)/python -m sphinx -E -W --keep-going -q -d build/docs/doctrees docs build/docs/html

@@ -21,10 +21,10 @@ from rcdsac_trl.training.learner import Learner
 EPISODES = 20
 
 
-def make_learner(algo: str, overrides: list[str]) -> Learner:
+def make_learner(algo: str, overrides: list[str], device: str = "cpu") -> Learner:
     """Make the learner of a training, its replay filled with random episodes of the configured sensor."""
     settings = training_settings(compose("train", [f"+algo={algo}", *overrides, "replay.capacity_steps=20000"]))
-    learner = setup.make_learner(settings, "cpu")
+    learner = setup.make_learner(settings, device)
     mask = torch.from_numpy(sensor_mask(settings.sensor.name))
     vectors = vector_observations(settings.sensor.memory_s)
     learner.replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask, vectors))

@@ -27,6 +27,7 @@ NAVIGATION = {
         "running",
         "continue",
         "evaluate",
+        "agents",
         "report",
         "calibrate",
         "planners",

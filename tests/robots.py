@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
+from rcdsac_trl.deploy.policy.weights import Weights
 
 POW: dict[str, Any] = {
     "name": "rcdsac_pow",

@@ -106,6 +106,58 @@ for size in (4, 8):
     assert found.stdout.split() == ["120", "4.0", "4.0", "360", "8.0", "8.0"]
 
 
+def test_accelerator(
+    load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Its small form on a CPU, whose layers are held against the kernels as a GPU's are."""
+    program = load("accelerator")
+    found = {
+        name: {key: value for line in measure("cpu") for key, value in line.items()}
+        for name, (measure, _) in program.PARTS.items()
+    }
+    assert found["correctness"]["agrees"]
+    assert 0.0 < found["correctness"]["full_precision_largest_relative_difference"] < program.LARGEST_DIFFERENCE
+    assert all(found[name]["plain_updates_per_second"] > 0 for name in ("laptop", "paper"))
+    assert found["collection"]["policy_on_cpu_agent_steps_per_second"] > 0
+    assert found["iteration"]["updates_seconds"] > 0
+    assert sum(seconds for _, seconds in program.PARTS.values()) <= 300
+    # A part is a process, which is ended when its time is.
+    assert program.measured("facts", "cpu", 0.01) == {"ended": "took longer than its 0.01 s"}
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
+    with pytest.raises(SystemExit) as left:
+        run(program, monkeypatch, "--device=cuda", f"--out={tmp_path / 'out.json'}")
+    assert left.value.code == 2
+    assert "torch does not see it here" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_graph_s_batch_is_filled_again_where_it_lies(load: Any) -> None:
+    program = load("accelerator")
+    learner = load("bench_common").make_learner("rcdsac_pow", SMALL)
+    first, second = program.prepared(learner), program.prepared(learner)
+    static = first.apply(program.held)
+    assert first["risk"].stride(1) == static["risk"].stride(1) == 0
+    places = {key: value.data_ptr() for key, value in static.items(True, True)}
+    assert (static == first).all()
+    assert not (first == second).all()
+    program.refill(static, second)
+    assert (static == second).all()
+    assert {key: value.data_ptr() for key, value in static.items(True, True)} == places
+
+
+def test_a_wrong_gradient_is_told(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = load("accelerator")
+    total = program.total
+    calls: list[int] = []
+
+    def a_percent_more_there(losses: Any) -> Any:
+        calls.append(1)
+        return total(losses) * (1.01 if len(calls) == 2 else 1.0)
+
+    monkeypatch.setattr(program, "total", a_percent_more_there)
+    assert program.largest_difference("cpu") == pytest.approx(0.01, rel=0.01)
+
+
 def test_scaling(load: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     learner, world = load("scaling_learner"), load("scaling_world")
     monkeypatch.setattr(learner, "LEARNER", {"quantiles": ("fractions", [2])})

@@ -1,7 +1,9 @@
 """The documents are true: their Python runs, their commands are accepted, what they name exists."""
 
+import json
 import os
 import re
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -15,6 +17,7 @@ from omegaconf import OmegaConf
 
 from rcdsac_trl import draw_maps
 from rcdsac_trl.agent.risk import MEASURES
+from rcdsac_trl.config.command_line import with_names
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.verbs import VERBS
@@ -94,6 +97,22 @@ def test_the_reward_term_of_contributing_needs_one_file(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_tables_of_agents_are_what_was_measured() -> None:
+    """`make tables` would change nothing; and there is something that it could change."""
+    tables = runpy.run_path(str(ROOT / "docs" / "tables.py"))
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert "<!-- agents: " in readme
+    for document in tables["DOCUMENTS"]:
+        text = document.read_text("utf-8")
+        assert tables["renewed"](text) == text, f"{document.name}: make tables"
+    first = json.loads((ROOT / "weights" / "sac-narrow" / "measured.json").read_text())["conditions"][0]["metrics"]
+    collisions = first["collisions"]
+    assert f"| SAC | {collisions['mean']:.2f} [{collisions['low']:.2f}, {collisions['high']:.2f}] | " in readme
+    assert tables["renewed"](readme.replace("| SAC | ", "| SAC | 9")) == readme
+    measured = tables["accelerator_table"]({"device": "cuda", "laptop": {"plain_updates_per_second": 123.456}})
+    assert measured.splitlines()[-1] == "| laptop | plain updates per second | 123.5 |"
+
+
 def commands() -> list[tuple[str, str]]:
     """Return verb and overrides of every command that names no folder of the reader's."""
     found = {text.split("#")[0].strip() for _, text in texts(rf"{COMMAND}(\w[^\n`]+)") if "<" not in text}
@@ -111,6 +130,8 @@ def test_commands_are_accepted(verb: str, arguments: str, tmp_path: Path, monkey
         first_combinations_only(monkeypatch)
         make_sweep([override for override in overrides if override != "-m"])
         return
+    if verb in ("agents", "verify"):
+        overrides = with_names("agents", overrides)
     overrides = [override.replace(NEW_ROW, "rcdsac_pow") for override in overrides]
     cfg = compose(verb, overrides)
     if verb == "train":

@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 import rcdsac_trl
-from rcdsac_trl.deploy import Policy, shipped_names
-from rcdsac_trl.deploy.policy.driving_record import driving_record
-from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, SHIPPED, model_card
+from rcdsac_trl.deploy import Policy, find_weights, shipped_names
+from rcdsac_trl.deploy.policy.registry import HANDFUL
+from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION
 from rcdsac_trl.world.maps.generator import GENERATOR_VERSION
 from rcdsac_trl.world.task.rules import RULES_VERSION
 from robots import ROWS, agent
@@ -63,12 +63,17 @@ def test_extras_that_are_named_exist() -> None:
 # ------------------------------------------------------------------------------------------------ what an agent says
 @pytest.mark.parametrize("name", shipped_names())
 def test_a_shipped_agent_says_how_it_drives(name: str) -> None:
-    policy = rcdsac_trl.load(name)
-    card = (SHIPPED / name / "README.md").read_text()
-    (first, *_) = policy.record
-    assert f"| {first.condition} | {first.collisions:.2f} [" in card
-    assert f"| {first.reward:.0f} [" in card
-    assert len(policy.record) == len(re.findall(r"^\| .*β|^\| SAC|^\| RCWR", card, re.M))
+    measured = rcdsac_trl.load(name).measured
+    assert measured is not None
+    card = (find_weights(name) / "README.md").read_text()
+    for condition in measured.conditions:
+        (line,) = [line for line in card.splitlines() if line.startswith(f"| {condition.label} | ")][:1]
+        assert f"| {condition.metrics['collisions'].mean:.2f} [" in line
+        assert f"| {condition.metrics['reward'].mean:.0f} [" in line
+
+
+def test_what_a_newcomer_needs_is_there() -> None:
+    assert set(HANDFUL) <= set(shipped_names())
 
 
 def test_what_a_policy_is_in_a_line() -> None:
@@ -84,8 +89,3 @@ def test_what_a_policy_is_in_a_line() -> None:
     assert said["rcwr"] == "Policy(rcwr, sensor narrow, collision_weight in [0.1, 2], robot paper)"
     remembering = repr(Policy(agent(memory_s=12.0, sensor="full")))
     assert remembering == "Policy(rcdsac_pow, sensor full, remembers 12 s, beta in [-2, 0], robot paper)"
-
-
-def test_a_card_without_results_says_nothing_of_them() -> None:
-    assert driving_record(model_card(agent())) == ()
-    assert driving_record("") == ()

@@ -17,6 +17,7 @@ import pytest
 import yaml
 
 import rcdsac_trl
+from rcdsac_trl.deploy.policy.registry import HANDFUL
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (
@@ -83,6 +84,15 @@ def test_the_wheel_holds_the_configuration_and_no_leftovers(installed: Path) -> 
     kinds = {".py", ".yaml", ".typed", ".csv", ".json", ".safetensors", ".md", ".html", ".css", ".js"}
     assert {Path(name).suffix for name in names if name.startswith("rcdsac_trl/")} == kinds
     assert "rcdsac_trl/report/paper.csv" in names
+
+
+def test_the_wheel_carries_a_handful_of_agents(installed: Path) -> None:
+    """And stays small: all others are in the repository alone."""
+    for name in HANDFUL:
+        assert files_below(installed / "rcdsac_trl" / "weights" / name) == files_below(ROOT / "weights" / name)
+    assert {path.name for path in (installed / "rcdsac_trl" / "weights").iterdir()} == set(HANDFUL)
+    (wheel,) = installed.parent.glob("*.whl")
+    assert wheel.stat().st_size < 20e6
 
 
 # What drives a robot: all else of the package's dependencies is kept from it.

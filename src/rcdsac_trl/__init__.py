@@ -43,9 +43,10 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
     """Return a trained agent that drives a robot.
 
     Args:
-        name_or_folder: an agent that comes with the package, a folder that ``python -m rcdsac_trl.export`` wrote, or
-            a run folder, whose best checkpoint it is then; every command takes the same three. Only the last needs
-            TorchRL, and takes seconds to import.
+        name_or_folder: an agent of those that ``python -m rcdsac_trl.agents`` lists (they come with the package, or lie
+            in the folder that the environment variable ``RCDSAC_TRL_WEIGHTS`` names), a folder that ``python -m
+            rcdsac_trl.export`` wrote, or a run folder, whose best checkpoint it is then; every command takes the same
+            three. Only the last needs TorchRL, and takes seconds to import.
         options: keywords of :class:`rcdsac_trl.deploy.Policy`.
 
     Raises:

@@ -5,7 +5,7 @@ from rcdsac_trl.cli import Command
 main = Command(
     "publish",
     "rcdsac_trl.release.publication:make_publication",
-    describe="rcdsac_trl.report.card:driving_section",
+    describe="rcdsac_trl.report.card:measured_values",
     look="rcdsac_trl.config.first_look:look_at_publication",
 )
 

@@ -18,7 +18,8 @@ from rcdsac_trl.agent.networks import Encoder
 from rcdsac_trl.deploy.export.modules import ActorStep
 from rcdsac_trl.deploy.policy.inference import Encoders
 from rcdsac_trl.deploy.policy.policy import Policy
-from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, SHIPPED, Weights, packed, read_weights, shipped_names
+from rcdsac_trl.deploy.policy.registry import shipped_agents
+from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, Weights, packed, read_weights
 from rcdsac_trl.robot.observation import RangeCode, range_observation
 from rcdsac_trl.robot.range_sensor import SENSORS, sensor_mask
 from robots import full_size
@@ -159,5 +160,5 @@ def test_weights_of_format_1_keep_their_reading(tmp_path: Path) -> None:
     old = read_weights(tmp_path)
     assert old.config == weights.config
     Policy(old)
-    for name in shipped_names():
-        assert read_weights(SHIPPED / name).config.padding in ("circular", "none")
+    for folder in shipped_agents().values():
+        assert read_weights(folder).config.padding in ("circular", "none")

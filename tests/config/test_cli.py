@@ -267,7 +267,7 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
     [
         ([], f"{EITHER} or baseline=<name>, such as mppi"),
         ([RUN, "baseline=pursuit"], f"{EITHER} or baseline=<name>, such as mppi"),
-        (["run=nowhere"], "there is no agent 'nowhere': shipped are "),
+        (["run=nowhere"], "there is no agent 'nowhere': "),
         (["run=123"], "run=123 must be text or null"),
         ([RUN, "beta=[]"], "beta=[] names none: leave it out for beta=[-2,-1.5,-1,-0.5], or give one"),
         ([RUN, "beta=[-1,-3]"], "beta = -3 is outside the domain [-2, 0] of measure 'pow'"),

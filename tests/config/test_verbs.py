@@ -15,6 +15,7 @@ import pytest
 import rcdsac_trl
 import rcdsac_trl.__main__ as program
 from rcdsac_trl import cli, replay
+from rcdsac_trl.config.command_line import with_names
 from rcdsac_trl.config.completion import bash_completion
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
@@ -58,6 +59,8 @@ def test_examples_are_accepted(verb: str, example: str) -> None:
         return
     if verb == "replay":
         overrides = replay.with_key(overrides)
+    if verb in ("agents", "verify"):
+        overrides = with_names("agents", overrides)
     cfg = compose(verb, overrides)
     if verb == "train" and cfg.resume is None:
         check_training(cfg)

@@ -12,7 +12,7 @@ import torch
 from torchrl.objectives import LossModule
 
 import rcdsac_trl
-from rcdsac_trl.deploy import Policy, find_weights, read_weights, shipped_names
+from rcdsac_trl.deploy import Policy, read_weights
 from rcdsac_trl.deploy.policy.weights import Weights, packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.run_weights import weights_of_run
@@ -95,21 +95,6 @@ def test_weights_that_are_not_finite_are_refused() -> None:
     broken["actor.head.output.bias"] = np.full_like(broken["actor.head.output.bias"], np.nan)
     with pytest.raises(UserInputError, match="not finite"):
         Weights(weights.config, broken)
-
-
-def test_names_and_folders(tmp_path: Path) -> None:
-    shipped = tmp_path / "shipped"
-    assert shipped_names(shipped) == []
-    with pytest.raises(UserInputError, match="there is no agent 'averse': none is shipped"):
-        find_weights("averse", shipped)
-    folder = written(shipped / "bold", agent())
-    assert shipped_names(shipped) == ["bold"]
-    assert find_weights("bold", shipped) == folder
-    assert find_weights(folder, shipped) == folder
-    with pytest.raises(UserInputError, match="there is no agent 'averse': shipped are bold; or name a run folder"):
-        find_weights("averse", shipped)
-    with pytest.raises(UserInputError, match=r"holds neither checkpoints nor config\.json: shipped are bold; or name"):
-        find_weights(tmp_path, shipped)
 
 
 def test_loading_and_driving_needs_none_of_the_training(tmp_path: Path) -> None:

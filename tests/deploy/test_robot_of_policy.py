@@ -17,11 +17,11 @@ from rcdsac_trl.deploy import (
     cloud_sectors,
     read_weights,
     scan_sectors,
-    shipped_names,
 )
 from rcdsac_trl.deploy.frames.sensor_mounts import mount_of
 from rcdsac_trl.deploy.policy.driver import Driver
-from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, SHIPPED, packed
+from rcdsac_trl.deploy.policy.registry import shipped_agents
+from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, packed
 from rcdsac_trl.deploy.sensors.cloud import CameraPose
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot import guard as guards
@@ -78,8 +78,8 @@ def test_weights_of_before_drive_the_papers_robot(tmp_path: Path) -> None:
     del config["robot"], config["restart_steps"], config["look_ahead"]
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 3}))
     assert read_weights(tmp_path).config == agent().config
-    for name in shipped_names():
-        assert read_weights(SHIPPED / name).config.robot == PAPER
+    for folder in shipped_agents().values():
+        assert read_weights(folder).config.robot == PAPER
 
 
 @pytest.mark.parametrize(

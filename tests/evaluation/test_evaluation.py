@@ -21,7 +21,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.deploy import shipped_names
+from rcdsac_trl.deploy import find_weights, shipped_names
+from rcdsac_trl.deploy.policy.weights import read_agent_config
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout import map_evaluator as driver
@@ -231,13 +232,14 @@ def test_an_exported_agent_does_what_its_run_does(run: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize("name", shipped_names())
 def test_every_shipped_agent_can_be_measured_again(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    row = name.partition("-")[0]
+    config, _ = read_agent_config(find_weights(name))
+    row = config.name
     betas = [f"beta={evaluation_betas(row)}".replace(" ", "")] if evaluation_betas(row) else []
     out = evaluate(f"run={name}", *betas, "seed=7", "num_episodes=1", "task=default", "task.episode_steps=20")
     assert out.parts[:1] == ("evaluation",)
     assert out.name.startswith(f"{name}-evaluation-seed7-1x1")
     described = json.loads((out / "evaluation.json").read_text())
-    assert (described["agent"], described["sensor"], described["checkpoint"]) == (row, "narrow", "last")
+    assert (described["agent"], described["sensor"], described["checkpoint"]) == (row, config.sensor, "last")
     assert described["map"]["size_m"] == 20.0
 
 
@@ -245,7 +247,7 @@ def test_what_is_no_agent_of_one_s_own_is_refused(run: Path, tmp_path: Path) -> 
     with pytest.raises(UserInputError, match="checkpoint=best chooses among those of a run, and run=sac-narrow is one"):
         evaluate("run=sac-narrow", "checkpoint=best")
     with pytest.raises(
-        UserInputError, match=r"holds neither checkpoints nor config\.json: shipped are dsac_pow-narrow"
+        UserInputError, match=r"holds neither checkpoints nor config\.json: .* agents` lists what there is"
     ):
         evaluate(f"run={tmp_path}")
     folder = exported(run, tmp_path / "agent")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,7 +31,7 @@ def test_a_grid_is_every_combination_named_by_what_tells_it_apart(tmp_path: Path
     assert list(made)[:3] == [
         "rcdsac_pow-narrow-gamma_0.9-s0",
         "rcdsac_pow-narrow-gamma_0.99-s0",
-        "rcdsac_pow-narrow-gamma_0.9-s1",
+        "sac-narrow-gamma_0.9-s0",
     ]
     assert len(made) == 8
     job = made["sac-narrow-gamma_0.9-s1"]
@@ -68,9 +69,18 @@ def test_the_table_is_the_papers_twenty_runs(monkeypatch: pytest.MonkeyPatch, tm
         ("rcwr",),
         ("sac",),
     ]
-    asked = ("split=evaluation", "num_maps=50", "num_episodes=10")
+    asked = ("checkpoint=last", "half_precision=true", "split=evaluation", "num_maps=50", "num_episodes=10")
     assert made["rcdsac_cvar-narrow-s0"].evaluate == ("beta=[0.25,0.5,0.75,1]", *asked)
     assert made["dsac_pow_-2-sparse-s0"].evaluate == asked
+
+
+def test_the_command_line_wins_over_the_table_which_begins_with_one_seed_of_everything() -> None:
+    made = jobs("+experiment=table", "preset=laptop", "seed=0,1,2", "experiment.only=[sac,dsac_pow_-2]")
+    kinds = ["dsac_pow_-2-narrow", "dsac_pow_-2-sparse", "sac-narrow", "sac-sparse"]
+    assert list(made) == [f"{kind}-s{seed}" for seed in (0, 1, 2) for kind in kinds]
+    for job in made.values():
+        assert [override for override in job.overrides if "preset" in override] == ["preset=laptop"]
+        assert [override for override in job.overrides if "seed" in override] == [f"seed={job.seed}"]
 
 
 @pytest.mark.parametrize("experiment", sorted(set(choices("experiment")) - {"grid", "table"}))
@@ -98,7 +108,7 @@ def test_the_command_line_narrows_an_experiment() -> None:
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        (["+experiment=tabel"], "experiment=tabel does not exist: choose one of grid, study, table, weights"),
+        (["+experiment=tabel"], "experiment=tabel does not exist: choose one of grid, study, table"),
         (["+algo=sac", "launcher=cloud"], "launcher=cloud does not exist: choose one of "),
         (["+experiment=table", "experiment.only=[ppo]"], "experiment.only=ppo is no run of the experiment: choose am"),
         (["+algo=sac", "experiment.only=[ppo]"], "experiment.only=ppo is no run of the experiment: choose among none"),
@@ -138,7 +148,7 @@ def states(folder: Path) -> dict[str, str]:
 def test_two_rows_and_two_seeds_and_the_same_call_again(calls: Calls, tmp_path: Path, capsys: Callable) -> None:
     asked = ["+algo=rcdsac_pow,sac", "seed=0,1", *SMALL, "hydra.sweep.dir=all"]
     make_sweep(asked).run()
-    names = ["rcdsac_pow-narrow-s0", "rcdsac_pow-narrow-s1", "sac-narrow-s0", "sac-narrow-s1"]
+    names = ["rcdsac_pow-narrow-s0", "sac-narrow-s0", "rcdsac_pow-narrow-s1", "sac-narrow-s1"]
     assert calls == [("train", name) for name in names]
     all_runs = tmp_path / "all"
     assert states(all_runs) == dict.fromkeys(names, "finished")
@@ -162,6 +172,29 @@ def test_two_rows_and_two_seeds_and_the_same_call_again(calls: Calls, tmp_path: 
 
     with pytest.raises(UserInputError, match=r"sac-narrow-s1 holds a run of another config \(learner.gamma\): choose"):
         make_sweep(["+algo=sac", "seed=1", *SMALL, "learner.gamma=0.5", "hydra.sweep.dir=moved"])
+
+
+def test_runs_that_come_from_another_machine_are_taken_up(calls: Calls, tmp_path: Path) -> None:
+    asked = ["+experiment=table", "experiment.only=[sac]", *SMALL, "schedule.iterations=2", "experiment.evaluate=null"]
+    elsewhere, table = tmp_path / "elsewhere", tmp_path / "multirun" / "table"
+    make_sweep([*asked, "sensor=narrow", f"hydra.sweep.dir={elsewhere}"]).run()
+    whole = tables(elsewhere)
+    # One that is half done, as a machine that went down leaves it, and of which no sweep knows here.
+    shutil.copytree(elsewhere / "sac-narrow-s0", table / "sac-narrow-s0")
+    shutil.rmtree(table / "sac-narrow-s0" / "checkpoints" / "iteration-000002")
+    (table / "sac-narrow-s0" / "state.json").unlink()
+    calls.clear()
+    make_sweep(asked).run()
+    assert calls == [("train", "sac-narrow-s0"), ("train", "sac-sparse-s0")]
+    assert states(table) == dict.fromkeys(("sac-narrow-s0", "sac-sparse-s0"), "finished")
+    assert load_progress(table / "sac-narrow-s0" / "checkpoints", "last").iterations == 2
+    assert tables(table).items() >= whole.items()
+    # One that has finished, too, and nothing is trained again.
+    shutil.rmtree(table / "sac-narrow-s0")
+    shutil.copytree(elsewhere / "sac-narrow-s0", table / "sac-narrow-s0")
+    calls.clear()
+    make_sweep(asked).run()
+    assert calls == []
 
 
 def test_a_failing_run_sinks_no_other_and_is_named_at_the_end(calls: Calls, tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def test_the_command_writes_a_folder_that_load_reads(
     ("asked", "told"),
     [
         ([], "name what to export: run=<folder>"),
-        (["run=nowhere"], "there is no agent 'nowhere': shipped are dsac_pow-narrow, "),
+        (["run=nowhere"], "there is no agent 'nowhere': .* agents` lists what there is"),
         (["run=x", "num_quantiles=0"], "num_quantiles=0 must be at least 1"),
         (["run=x", "checkpoint=newest"], "checkpoint=newest must be one of best, last"),
     ],

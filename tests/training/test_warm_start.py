@@ -86,7 +86,7 @@ def test_what_a_user_chooses_holds() -> None:
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
-        (["init=nobody"], "^there is no agent 'nobody': shipped are "),
+        (["init=nobody"], "^there is no agent 'nobody': "),
         (["+algo=sac", "init=''"], "^init names no agent"),
         (
             ["init=rcdsac_pow-narrow", "algo.beta=-1"],

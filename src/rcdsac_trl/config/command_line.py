@@ -3,6 +3,8 @@
 import os
 import re
 import shlex
+from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 
 from rcdsac_trl.errors import UserInputError
@@ -90,6 +92,21 @@ def listed(key: str, value: str) -> str:
         return f"{key}=[{value}]"
     escaped = value.replace('"', '\\"')
     return shlex.quote(f'{key}=["{escaped}"]')
+
+
+def with_names(key: str, words: Sequence[str]) -> list[str]:
+    """Put the key before names that stand first without it, in one list.
+
+    Example:
+        >>> with_names("agents", ["sac-narrow", "rcwr-narrow", "seed=1"])
+        ['agents=["sac-narrow","rcwr-narrow"]', 'seed=1']
+        >>> with_names("agents", ["seed=1"]), with_names("agents", ["--help"])
+        (['seed=1'], ['--help'])
+    """
+    names = list(takewhile(lambda word: word and not word.startswith("-") and "=" not in word, words))
+    escaped = [name.replace("\\", "\\\\").replace('"', '\\"') for name in names]
+    listed_names = ",".join(f'"{name}"' for name in escaped)
+    return [*([f"{key}=[{listed_names}]"] if names else []), *words[len(names) :]]
 
 
 def unreadable(override: str, overrides: list[str]) -> str:

@@ -112,6 +112,7 @@ class EvaluationSettings:
     controller: ControllerSettings
     navigation: NavigationSettings
     checkpoint: Name | None
+    half_precision: bool
     baseline: str | None
     split: Literal["evaluation", "validation"]
     seed: int
@@ -141,6 +142,8 @@ class EvaluationSettings:
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
         if self.baseline is not None and (self.navigation.replan or self.navigation.watchdog):
             raise UserInputError(f"baseline={self.baseline} navigates by itself: leave navigation out")
+        if self.baseline is not None and self.half_precision:
+            raise UserInputError(f"baseline={self.baseline} has no weights to be rounded: leave half_precision out")
         asked = self.beta_controller or ()
         if asked and self.baseline is not None:
             raise UserInputError(f"baseline={self.baseline} has no beta to turn: leave beta_controller out")

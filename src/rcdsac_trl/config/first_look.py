@@ -19,6 +19,7 @@ from rcdsac_trl.config.named_folder import default_training, find_agent
 from rcdsac_trl.config.play_settings import PlaySettings
 from rcdsac_trl.config.replay_settings import ReplaySettings
 from rcdsac_trl.config.run_config import agent_of_run, read_config
+from rcdsac_trl.config.shipped_settings import VerificationSettings
 from rcdsac_trl.deploy import find_weights
 from rcdsac_trl.deploy.recordings.open_recording import open_recording
 from rcdsac_trl.system.listening import check_can_listen
@@ -92,6 +93,17 @@ def look_at_publication(cfg: DictConfig) -> None:
         agent_of_run(Path(run))
     for folder in (settings.weights, settings.results):
         check_writable(Path(folder))
+
+
+def look_at_verification(cfg: DictConfig) -> None:
+    """Refuse settings and agents that `verify` cannot take.
+
+    Raises:
+        UserInputError: naming what is wrong.
+    """
+    settings = read_config(cfg, VerificationSettings)
+    settings.claims()
+    check_writable(Path(settings.out))
 
 
 def look_at_play(cfg: DictConfig) -> None:

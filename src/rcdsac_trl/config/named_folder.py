@@ -13,7 +13,7 @@ from rcdsac_trl.config.run_config import (
     training_settings,
 )
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.deploy.policy.weights import find_weights
+from rcdsac_trl.deploy.policy.registry import find_weights
 from rcdsac_trl.errors import UserInputError
 
 

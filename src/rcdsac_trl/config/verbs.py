@@ -135,6 +135,22 @@ VERBS = {
         groups=_ROW,
         more_roots={"train": "of what is trained"},
     ),
+    "agents": Verb(
+        does="list the trained agents that are here, and how they drive",
+        examples={
+            "sac-narrow": "one of them; without a name, all",
+            "format=json": "all that is known of each, for programs",
+            "sac-narrow rcwr-narrow format=json": "of these two",
+        },
+    ),
+    "verify": Verb(
+        does="measure shipped agents again, and say whether their cards' numbers hold",
+        examples={
+            "seed=7": "those of the wheel, on maps of your choosing: about 5 minutes on two cores",
+            "rcdsac_pow-narrow num_maps=100": "one agent, more surely",
+            "sac-narrow seed=0 num_maps=50 num_episodes=10": "on the card's own maps",
+        },
+    ),
     "publish": Verb(
         does="turn evaluated runs into agents that ship with the package",
         examples={

@@ -3,6 +3,7 @@
 Nothing here needs PyBullet, Hydra, TorchRL or torch, but for :mod:`rcdsac_trl.deploy.export`, which writes ONNX.
 """
 
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.beta_controllers import (
     BetaController,
     ClearanceBeta,
@@ -13,7 +14,8 @@ from rcdsac_trl.deploy.policy.command import Command, Outlook
 from rcdsac_trl.deploy.policy.input_checks import InputLimits, Stamps
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.deploy.policy.policy import Policy
-from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights, find_weights, read_weights, shipped_names
+from rcdsac_trl.deploy.policy.registry import find_weights, shipped_names
+from rcdsac_trl.deploy.policy.weights import Weights, read_weights
 from rcdsac_trl.deploy.sensors.cloud import CameraPose, CloudFilter, cloud_sectors
 from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors
 from rcdsac_trl.robot.guard import Guard

@@ -52,7 +52,9 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
         check_extra()
     if settings.gui:
         check_display()
-    named = None if settings.run is None else named_agent(settings.run, settings.checkpoint)
+    named = None
+    if settings.run is not None:
+        named = named_agent(settings.run, settings.checkpoint, half_precision=settings.half_precision)
     trained = default_training() if named is None else named.settings
     chosen = settings.world_of(trained)
     check_maps(chosen.maps, chosen.task.min_path_m, chosen.robot.circumradius_m)

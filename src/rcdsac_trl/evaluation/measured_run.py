@@ -81,9 +81,7 @@ class MeasuredRun:
         Raises:
             UserInputError: if something else was written into the folder meanwhile.
         """
-        rows = self._measured()
-        found = self._findings(rows)
-        self.results.write(found.tables)  # first: what follows may find the disk full that the output goes to
+        rows = self.measure_and_write()  # first: what follows may find the disk full that the output goes to
         if describe is not None:
             with Work("tables and figures of them", 1, "report"):
                 described = describe(self.results.path)
@@ -93,6 +91,16 @@ class MeasuredRun:
             print(f"filmed: {', '.join(map(str, self._film(self.results.path, rows)))}")
         if self._next_step:
             print(f"next: {' '.join([program(), *self._next_step])}")
+
+    def measure_and_write(self) -> Rows:
+        """Measure all units, write the tables, and return the rows.
+
+        Raises:
+            UserInputError: as :meth:`run`.
+        """
+        rows = self._measured()
+        self.results.write(self._findings(rows).tables)
+        return rows
 
     def _measured(self) -> Rows:
         """Measure all units, and keep the tables of those that have ended."""

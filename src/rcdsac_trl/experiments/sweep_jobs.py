@@ -66,7 +66,7 @@ def make_sweep(overrides: list[str]) -> Sweep:
     launcher = read_launcher(values["launcher"])
     # As composed once: its default name is the time.
     folder = sweep_folder(CONFIG, [*own, f"experiment.name='{experiment.name}'"]).absolute()
-    found = list(_jobs(experiment, given, folder))
+    found = _one_seed_first(_jobs(experiment, given, folder))
     jobs = [job for job, _ in found]
     _check_names(jobs)
 
@@ -75,6 +75,13 @@ def make_sweep(overrides: list[str]) -> Sweep:
     for _, trained in found:
         check_machine(trained)
     return Sweep(folder, experiment.name, jobs, launcher)
+
+
+def _one_seed_first(jobs: Iterable[tuple[Job, TrainingSettings]]) -> list[tuple[Job, TrainingSettings]]:
+    """Let every run have its first seed before any has its second: what breaks off has a whole table the sooner."""
+    found = list(jobs)
+    seeds = list(dict.fromkeys(job.seed for job, _ in found))
+    return sorted(found, key=lambda entry: seeds.index(entry[0].seed))
 
 
 def _jobs(experiment: ExperimentSettings, given: list[str], folder: Path) -> Iterator[tuple[Job, TrainingSettings]]:

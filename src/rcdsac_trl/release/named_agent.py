@@ -23,7 +23,8 @@ from rcdsac_trl.config.run_config import (
     settings_of_run,
 )
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.deploy.policy.weights import SHIPPED, WEIGHTS_NAME, Weights, read_weights
+from rcdsac_trl.deploy.policy.registry import is_shipped
+from rcdsac_trl.deploy.policy.weights import WEIGHTS_NAME, Weights, halved, read_weights, stored
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.run_weights import TEMPERATURE, agent_config, states_of_weights, weights_of_run
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
@@ -95,10 +96,17 @@ class NamedAgent(ABC):
 
 @dataclass(frozen=True)
 class RunAgent(NamedAgent):
-    """The agent of a run at a checkpoint."""
+    """The agent of a run at a checkpoint.
+
+    Attributes:
+        folder: of the run.
+        checkpoint: which of them.
+        half_precision: take the averaged actor and the critics as :mod:`~rcdsac_trl.release.publication` ships them.
+    """
 
     folder: Path
     checkpoint: Name
+    half_precision: bool = False
 
     @cached_property
     def settings(self) -> TrainingSettings:
@@ -107,8 +115,11 @@ class RunAgent(NamedAgent):
 
     @property
     def described(self) -> dict[str, Any]:
-        """Its checkpoint."""
-        return {"checkpoint": self.checkpoint}
+        """Its checkpoint; and the digest of the weights that would ship, where these are taken."""
+        shipped = (
+            {"weights_sha256": sha256(stored(self._shipped, half=True)).hexdigest()} if self.half_precision else {}
+        )
+        return {"checkpoint": self.checkpoint} | shipped
 
     @property
     def out(self) -> Path:
@@ -117,8 +128,8 @@ class RunAgent(NamedAgent):
 
     @property
     def stem(self) -> str:
-        """The checkpoint."""
-        return str(self.checkpoint)
+        """The checkpoint, and whether it is taken as it ships."""
+        return f"{self.checkpoint}{'-half' if self.half_precision else ''}"
 
     @property
     def training(self) -> bytes:
@@ -127,14 +138,21 @@ class RunAgent(NamedAgent):
 
     def weights(self) -> Weights:
         """Read the averaged actor and the critics."""
-        return weights_of_run(self.folder, self.checkpoint)
+        return self._shipped if self.half_precision else weights_of_run(self.folder, self.checkpoint)
+
+    @cached_property
+    def _shipped(self) -> Weights:
+        """Read once: a training that goes on may write another checkpoint meanwhile."""
+        return halved(weights_of_run(self.folder, self.checkpoint))
 
     def check(self) -> None:
         """Refuse a checkpoint that is not there, or damaged."""
         find(self.folder / CHECKPOINTS, self.checkpoint)
 
     def load(self) -> tuple[LossModule, AveragedModel]:
-        """Load both from the checkpoint."""
+        """Load both from the checkpoint, or what would ship of it."""
+        if self.half_precision:
+            return _load(self._shipped, self.settings)
         loss = make_loss(self.settings, "cpu")
         average = make_average(loss, self.settings.learner)
         for damaged in load_weights(self.folder / CHECKPOINTS, self.checkpoint, loss=loss, average=average):
@@ -180,7 +198,7 @@ class ExportedAgent(NamedAgent):
 
     @property
     def _is_shipped(self) -> bool:
-        return self.folder.resolve().parent == SHIPPED
+        return is_shipped(self.folder)
 
     @property
     def training(self) -> bytes | None:
@@ -196,29 +214,42 @@ class ExportedAgent(NamedAgent):
         """Do nothing: it was read as a whole."""
 
     def load(self) -> tuple[LossModule, AveragedModel]:
-        """Load both; the averaged actor, which is the only one here, stands for the learning one as well."""
-        loss = make_loss(self.settings, "cpu")
-        average = make_average(loss, self.settings.learner)
-        of_loss, of_average = states_of_weights(self.read)
-        loss.load_state_dict(loss.state_dict() | of_loss)
-        average.load_state_dict(average.state_dict() | of_average)
-        return loss, average
+        """Load both."""
+        return _load(self.read, self.settings)
 
     def load_critics(self) -> LossModule:
-        """Load the critics, the averaged actor and the temperature that the export has written down."""
-        temperature = self.read.config.provenance.get(TEMPERATURE)
-        if not isinstance(temperature, int | float) or not 0.0 < temperature < math.inf:
+        """Load them as the export has written them down."""
+        if _temperature(self.read) is None:
             raise UserInputError(
                 f"{self.folder} does not say at which temperature its critics were trained, which the returns that "
                 "they predict depend on: export the agent anew, or name its run folder"
             )
-        loss, _ = self.load()
+        return self.load()[0]
+
+
+def _load(weights: Weights, trained: TrainingSettings) -> tuple[LossModule, AveragedModel]:
+    """Load loss and averaged actor, which is the only one here and stands for the learning one as well.
+
+    The loss gets the temperature, too, where that is known.
+    """
+    loss = make_loss(trained, "cpu")
+    average = make_average(loss, trained.learner)
+    of_loss, of_average = states_of_weights(weights)
+    loss.load_state_dict(loss.state_dict() | of_loss)
+    average.load_state_dict(average.state_dict() | of_average)
+    if (temperature := _temperature(weights)) is not None:
         with torch.no_grad():
             loss.log_alpha.fill_(math.log(temperature))
-        return loss
+    return loss, average
 
 
-def named_agent(named: str | Path, checkpoint: Name | None = None) -> NamedAgent:
+def _temperature(weights: Weights) -> float | None:
+    """Return what an agent's critics were trained at, if its files say so."""
+    temperature = weights.config.provenance.get(TEMPERATURE)
+    return temperature if isinstance(temperature, int | float) and 0.0 < temperature < math.inf else None
+
+
+def named_agent(named: str | Path, checkpoint: Name | None = None, *, half_precision: bool = False) -> NamedAgent:
     """Return the agent of a name: a run folder, a folder that ``export`` wrote, or an agent that is shipped.
 
     See :func:`~rcdsac_trl.config.named_folder.find_agent`.
@@ -226,13 +257,18 @@ def named_agent(named: str | Path, checkpoint: Name | None = None) -> NamedAgent
     Args:
         named: what the user says.
         checkpoint: of a run, ``"best"`` where it is None; an exported agent is of one checkpoint, and has no choice.
+        half_precision: of a run: take it as it would ship; an exported agent is what it is, and has no choice.
 
     Raises:
         UserInputError: if there is no such agent, or its weights cannot be read.
     """
     found = find_agent(named)
     if found.is_run:
-        return RunAgent(found.path, "best" if checkpoint is None else checkpoint)
+        return RunAgent(found.path, "best" if checkpoint is None else checkpoint, half_precision)
+    if half_precision:
+        raise UserInputError(
+            f"half_precision=true rounds the agent of a run, and run={named} is one that has been written: leave it out"
+        )
     weights = read_weights(found.path)
     own = weights.config.provenance.get("checkpoint")
     if checkpoint not in (None, own):

@@ -1,32 +1,38 @@
-"""Agents that are shipped: small weights with a card, and the tables that say how they learnt and drive."""
+"""Agents that are shipped: small weights, what was measured of them, a card, and the tables behind it."""
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
-from rcdsac_trl.deploy import Policy
-from rcdsac_trl.deploy.policy.weights import Weights, halved, packed
+from rcdsac_trl.deploy.policy.measured import Measured, measured_of
+from rcdsac_trl.deploy.policy.model_card import limits_of
+from rcdsac_trl.deploy.policy.registry import agent_name
+from rcdsac_trl.deploy.policy.weights import Weights, halved, packed, stored
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import RunAgent, named_agent
+from rcdsac_trl.release.rounding import check_rounding, largest_differences
 from rcdsac_trl.release.run_weights import weights_of_run
-from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER
-from rcdsac_trl.seeding import stream
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.system.resources import check_writable
+from rcdsac_trl.world.maps.generator import MapSettings
+from rcdsac_trl.world.task.rules import TaskSettings
 
 # What stays of a run, where it has it: enough for every table and figure of a report.
 _TABLES = ("config.yaml", "training_episodes.csv", "validation_episodes.csv", "csv/scalars/time/elapsed_s.csv")
 _EVALUATION = ("evaluation.json", "episodes.csv", "collisions.csv")
-# Steps over which half precision is compared with single.
-_STEPS = 200
+
+Describe = Callable[[Path, Path | None], dict[str, Any]]
+"""Returns what an evaluation, and a calibration if there is one, say of an agent."""
 
 
 @dataclass(frozen=True)
@@ -35,15 +41,43 @@ class Published:
 
     Attributes:
         run: folder of its run.
-        weights: of its agent.
+        weights: of its agent, as it was trained.
+        small: these in half precision, as they ship.
         training: the config of its training, as a file.
         evaluation: folder of the evaluation that its card quotes.
+        as_shipped: whether that drove the weights that ship.
+        calibration: folder of the calibration that its card quotes; None where there is none.
     """
 
     run: Path
     weights: Weights
+    small: Weights
     training: bytes
     evaluation: Path
+    as_shipped: bool
+    calibration: Path | None
+
+    def measured(self, name: str, precision: Mapping[str, float], describe: Describe) -> Measured:
+        """Return what is known of it.
+
+        Args:
+            name: that it gets.
+            precision: what rounding changed.
+            describe: returns what the folders say.
+        """
+        values = describe(self.evaluation, self.calibration)
+        told = values["protocol"]
+        again = f"seed={told['seed']} num_maps={told['num_maps']} num_episodes={told['num_episodes']}"
+        return measured_of(
+            values
+            | {
+                "weights_sha256": _digest(self.small),
+                "as_shipped": self.as_shipped,
+                "command": f"python -m rcdsac_trl.verify {name} {again}",
+                "precision": precision,
+                "limits": limits_of(self.weights.config),
+            }
+        )
 
 
 @dataclass(frozen=True)
@@ -60,18 +94,19 @@ class Publication:
     weights: Path
     results: Path
 
-    def run(self, describe: Callable[[Path], str]) -> None:
+    def run(self, describe: Describe) -> None:
         """Write all of them, and print a sentence on each.
 
         Args:
-            describe: returns what a card says of an evaluation, whose folder it is given.
+            describe: returns the measured numbers of folders.
+
+        Raises:
+            FaultError: if half precision changes one too much; it is not written then.
         """
         for name, agent in self.agents.items():
-            small = halved(agent.weights)
-            differs = _largest_difference(agent.weights, small)
-            stored = (
-                f"Stored in half precision, which changed its speeds by at most {differs:.1e} m/s in {_STEPS} steps.\n"
-            )
+            differences = largest_differences(agent.weights, agent.small)
+            check_rounding(name, differences)
+            measured = agent.measured(name, differences, describe)
             # The tables come first: who finds weights finds what is said of them.
             evaluation = agent.evaluation.relative_to(agent.run)
             for path in (*map(Path, _TABLES), *(evaluation / file for file in _EVALUATION)):
@@ -80,14 +115,18 @@ class Publication:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     atomic.write(target, (agent.run / path).read_bytes())
             # The config comes last here, too: a folder that has one is complete.
-            files = {TRAINING_NAME: agent.training} | packed(
-                small, half=True, results=f"{describe(agent.evaluation).strip()}\n\n{stored}"
-            )
+            files = {TRAINING_NAME: agent.training} | packed(agent.small, half=True, measured=measured)
             (self.weights / name).mkdir(parents=True, exist_ok=True)
             for file, content in files.items():
                 atomic.write(self.weights / name / file, content)
-            size = sum(map(len, files.values()))
-            print(f"{name}: {size / 1e6:.1f} MB; half precision changes its speeds by at most {differs:.1e} m/s")
+            print(f"{name}: {sum(map(len, files.values())) / 1e6:.1f} MB, {_said(measured)}")
+
+
+def _said(measured: Measured) -> str:
+    """Say in a line what is quoted of an agent."""
+    of = "as it ships" if measured.as_shipped else "in single precision, of which it differs by rounding"
+    calibrated = "" if measured.calibration else "; no calibration is quoted"
+    return f"measured {of}, {measured.num_episodes} episodes under {len(measured.conditions)} conditions{calibrated}"
 
 
 def make_publication(cfg: DictConfig) -> Publication:
@@ -107,10 +146,14 @@ def make_publication(cfg: DictConfig) -> Publication:
             )
         weights = weights_of_run(run, settings.checkpoint)
         config = weights.config
-        name = f"{config.name}-{config.sensor}" + ("" if config.robot == PAPER else f"-{config.robot.name}")
+        robot = None if config.robot == PAPER else config.robot.name
+        name = agent_name(config.name, config.fixed_beta, config.sensor, robot)
         if name in agents:
             raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
-        agents[name] = Published(run, weights, agent.training, _evaluation_of(run, settings.checkpoint))
+        small = halved(weights)
+        evaluation, as_shipped = _evaluation_of(run, settings.checkpoint, _digest(small))
+        calibration = _calibration_of(run, settings.checkpoint)
+        agents[name] = Published(run, weights, small, agent.training, evaluation, as_shipped, calibration)
     for folder in (Path(settings.weights), Path(settings.results)):
         check_writable(folder)
         for name in agents:
@@ -119,37 +162,64 @@ def make_publication(cfg: DictConfig) -> Publication:
     return Publication(agents, Path(settings.weights), Path(settings.results))
 
 
-def _evaluation_of(run: Path, checkpoint: Name) -> Path:
-    """Return the evaluation of a run that is published: of that checkpoint, on evaluation maps, with most episodes.
+def _digest(small: Weights) -> str:
+    """Return the SHA-256 of the file that weights in half precision are stored in."""
+    return sha256(stored(small, half=True)).hexdigest()
+
+
+def _evaluation_of(run: Path, checkpoint: Name, digest: str) -> tuple[Path, bool]:
+    """Return the evaluation of a run that is published, and whether it drove the weights that ship.
+
+    It is of that checkpoint, on evaluation maps, of the agent alone. One on the default maps and task comes before
+    others, for they are what agents compare on; then one of the weights as they ship, then that with most episodes.
+
+    Args:
+        run: its folder.
+        checkpoint: of the agent.
+        digest: SHA-256 of the weights that ship.
 
     Raises:
         UserInputError: if there is none.
     """
     found = {}
+    others = 0
+    default = _plain(asdict(MapSettings())), _plain(asdict(TaskSettings()))
     for path in sorted(run.glob("evaluation/*/evaluation.json")):
         described = json.loads(path.read_bytes())
         measured = described["checkpoint"], described["split"]
-        if measured == (checkpoint, "evaluation") and not described.get("controller"):
-            found[path.parent] = described["num_maps"] * described["num_episodes"]
+        if measured != (checkpoint, "evaluation") or _is_helped(described):
+            continue
+        driven = described.get("weights_sha256")
+        if driven not in (None, digest):
+            others += 1
+            continue
+        number = described["num_maps"] * described["num_episodes"] * len(described["conditions"])
+        found[path.parent] = ((described["map"], described["task"]) == default, driven == digest, number)
     if not found:
-        raise UserInputError(
-            f"{run} has no evaluation of its checkpoint {checkpoint}: "
-            f"{program()} evaluate {assigned('run', run.as_posix())} checkpoint={checkpoint}"
-        )
-    return max(found, key=lambda folder: found[folder])
+        called = f"{program()} evaluate {assigned('run', run.as_posix())} checkpoint={checkpoint} half_precision=true"
+        stale = f" ({others} are of other weights: it was trained on)" if others else ""
+        raise UserInputError(f"{run} has no evaluation of its checkpoint {checkpoint}{stale}: {called}")
+    best = max(found, key=lambda folder: found[folder])
+    return best, found[best][1]
 
 
-def _largest_difference(one: Weights, other: Weights) -> float:
-    """Return how far the speeds differ at most, m/s, that two agents want where they see the same."""
-    rng = stream(0, "publish")
-    policies = [Policy(weights, guard=None) for weights in (one, other)]
-    largest = 0.0
-    for _ in range(_STEPS):
-        ranges = rng.uniform(0.3, 6.0, NUM_BINS)
-        waypoints = rng.uniform(-3.0, 3.0, (2, 2))
-        velocity = rng.uniform((-0.2, -1.5), (0.6, 1.5))
-        wanted = [policy.act(ranges, waypoints, velocity).wanted for policy in policies]
-        assert wanted[0] is not None
-        assert wanted[1] is not None
-        largest = max(largest, abs(wanted[0][0] - wanted[1][0]))
-    return largest
+def _is_helped(described: Mapping[str, Any]) -> bool:
+    """Tell whether an evaluation says more, or less, than how an agent drives by itself."""
+    navigated = any((described.get("navigation") or {}).values())
+    return navigated or bool(described.get("controller") or described["sampled"])
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values as JSON has them, which knows no tuples."""
+    read: dict[str, Any] = json.loads(json.dumps(values))
+    return read
+
+
+def _calibration_of(run: Path, checkpoint: Name) -> Path | None:
+    """Return the calibration that is quoted: of that checkpoint, on evaluation maps, with most roll-outs."""
+    found = {}
+    for path in sorted(run.glob("calibration/*/calibration.json")):
+        described = json.loads(path.read_bytes())
+        if (described["checkpoint"], described["split"]) == (checkpoint, "evaluation"):
+            found[path.parent] = described["num_maps"] * described["num_states"] * described["num_rollouts"]
+    return max(found, key=lambda folder: found[folder]) if found else None

@@ -14,7 +14,8 @@ from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import CHECKPOINTS, AgentOfRun, agent_of_run
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.deploy.policy.weights import AgentConfig, Context, Weights
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig, Context
+from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage.checkpoint import load_states
 from rcdsac_trl.storage.checkpoint_record import Progress

@@ -7,6 +7,7 @@ quantiles below a return (*probability integral transform*, PIT) is uniform over
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -158,13 +159,24 @@ def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFr
     return figure
 
 
+def calibration_of(folder: Path) -> pd.DataFrame:
+    """Return the :func:`calibration_table` of a folder that ``calibrate`` wrote."""
+    described, predictions, returns = _read(folder)
+    return calibration_table(predictions, returns, described["gamma"], described["horizon_steps"])
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame, pd.DataFrame]:
+    """Return the description, the predictions and the returns of a calibration."""
+    described = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+    return described, pd.read_csv(folder / "predictions.csv"), pd.read_csv(folder / "returns.csv")
+
+
 def write_calibration(folder: Path) -> str:
     """Write ``calibration.csv`` and ``.png`` of a folder that ``calibrate`` wrote; return the table as text.
 
     Where the folder holds a cross-evaluation, it is written and said, too.
     """
-    described = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
-    predictions, returns = (pd.read_csv(folder / f"{name}.csv") for name in ("predictions", "returns"))
+    described, predictions, returns = _read(folder)
     table = calibration_table(predictions, returns, described["gamma"], described["horizon_steps"])
     table.to_csv(folder / "calibration.csv", index=False, float_format="%.6g")
     title = f"{described['agent']}, sensor {described['sensor']}, {described['checkpoint']}: predicted and real returns"

@@ -1,57 +1,97 @@
-"""What a model card says of how an agent drives."""
+"""What is measured of an agent, as the numbers that its card, lists and tables are made from."""
 
+import json
+import math
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import findings
+from rcdsac_trl.report.calibration_report import COVERED, calibration_of
+from rcdsac_trl.report.collision_report import of_episodes
 from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.statistics import CONFIDENCE
-from rcdsac_trl.report.table import markdown
-
-# Statistic of `findings.summary`, and what it is called in a card.
-_SHOWN = {
-    "collisions": "collisions",
-    "reward": "reward",
-    "collision_free": "free of collision",
-    "goals": "goals",
-    "mean_speed_m_per_s": "m/s",
-    "success": "first goal reached untouched",
-}
+from rcdsac_trl.report.table import row_label
 
 
-def driving_section(evaluation: Path) -> str:
-    """Return a section of Markdown with the means of an evaluation and their intervals.
+def measured_values(evaluation: Path, calibration: Path | None = None) -> dict[str, Any]:
+    """Return what was measured of an agent, as plain values.
 
     Args:
-        evaluation: a folder that ``evaluate`` wrote.
+        evaluation: a folder that ``evaluate`` wrote, of an agent or a baseline under fixed conditions.
+        calibration: a folder that ``calibrate`` wrote; None: there is none.
+
+    Returns:
+        The entries of ``measured.json`` that follow from the two: `row`, `conditions`, `protocol`, `rules_version`,
+        `map_version`, `confidence`, `train_seed`, `commit` and `calibration`. See
+        :class:`rcdsac_trl.deploy.policy.measured.Measured`.
 
     Raises:
-        UserInputError: if it cannot be read.
+        UserInputError: if one cannot be read.
     """
+    described = json.loads((evaluation / "evaluation.json").read_text(encoding="utf-8"))
+    protocol = {key: described[key] for key in ("split", "seed", "num_maps", "num_episodes", "sampled", "map", "task")}
+    return {
+        "row": row_label(described["agent"]),
+        "conditions": _conditions(evaluation),
+        "protocol": protocol,
+        # Rules of version 1 did not say that they were.
+        "rules_version": described["task"].get("version", 1),
+        "map_version": described["map"].get("version", 1),
+        "confidence": CONFIDENCE,
+        "train_seed": described["train_seed"],
+        "commit": described["commit"],
+        "calibration": [] if calibration is None else _calibration(calibration),
+    }
+
+
+def _conditions(evaluation: Path) -> list[dict[str, Any]]:
     episodes = read_episodes([evaluation])
-    told = episodes.protocol
+    labels = findings.labels(episodes)
     summary = findings.summary(episodes)
-    summary = summary[summary["statistic"].isin(_SHOWN)]
-    cells = summary.assign(cell=[_cell(*row) for row in summary[["value", "low", "high"]].itertuples(index=False)])
-    wide = cells.pivot(index="condition", columns="statistic", values="cell")
-    order = list(dict.fromkeys(summary["condition"]))
-    shown = [name for name in _SHOWN if name in wide]
-    table = wide.loc[order, shown].rename(columns=_SHOWN).rename_axis(columns=None).reset_index()
-    number = told["num_maps"] * told["num_episodes"]
-    return f"""
-## How it drives
+    by_thing = of_episodes(episodes, labels)
+    conditions = []
+    for (_, condition), label in zip(episodes.conditions.iterrows(), labels, strict=True):
+        of_condition = summary[(summary["condition"] == label) & summary["statistic"].isin(episodes.metrics)]
+        metrics = {
+            row["statistic"]: {"mean": row["value"], "low": row["low"], "high": row["high"]}
+            for _, row in of_condition.dropna().iterrows()
+        }
+        hit = by_thing[by_thing["condition"] == label] if len(by_thing) else by_thing
+        conditions.append(
+            {
+                "label": label,
+                "beta": _number(condition["beta"]),
+                "collision_weight": _number(condition["collision_weight"]),
+                "metrics": metrics,
+                "collisions_by_thing": {
+                    row["thing"]: {key: _number(row[key]) for key in ("per_episode", "outside_share", "never_share")}
+                    for _, row in hit.iterrows()
+                },
+            }
+        )
+    return conditions
 
-Means of {number} episodes of {told["task"]["episode_steps"]} steps on {told["num_maps"]} {told["split"]} maps
-(seed {told["seed"]}), which it was never trained on and never chosen by; {CONFIDENCE:.0%} intervals with the map as the
-unit. One training seed: another agent of the same recipe will differ.
 
-{markdown(table)}
-"""
+def _calibration(folder: Path) -> list[dict[str, Any]]:
+    try:
+        table = calibration_of(folder)
+    except (OSError, ValueError, KeyError) as error:
+        raise UserInputError(f"{folder} cannot be read ({error}): calibrate again into another folder") from error
+    return [
+        {
+            "beta": _number(row["beta"]),
+            "states": int(row["states"]),
+            "tail_depth": _number(row["tail_depth"]),
+            "predicted_tail_depth": _number(row["predicted_tail_depth"]),
+            "coverage": {f"{fraction:g}": _number(row[f"coverage_{fraction:g}"]) for fraction in COVERED},
+        }
+        for _, row in table.iterrows()
+    ]
 
 
-def _cell(value: float, low: float, high: float) -> str:
-    digits = 0 if abs(value) >= 100 else 2
-    if pd.isna(value):
-        return ""
-    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+def _number(value: Any) -> float | None:
+    """Return a number as JSON has it, which knows no NaN."""
+    return None if pd.isna(value) or not math.isfinite(value) else float(value)

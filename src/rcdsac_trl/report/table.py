@@ -55,12 +55,21 @@ def condition_label(
     agent: str, sensor: str, beta: float, weight: float, controller: str | None, sensors: int = 1
 ) -> str:
     """Name a condition in figures and lists; the sensor only where there are several."""
-    name, psi = _called(agent)
     if isinstance(controller, str):
         told = f" β by {controller.replace('_', ' ')}"
     else:
         told = f" β = {beta:g}" if pd.notna(beta) else f" w_coll = {weight:g}" if pd.notna(weight) else ""
-    return f"{name}{' ' + psi if psi else ''}{told}{', ' + sensor if sensors > 1 else ''}"
+    return f"{row_label(agent)}{told}{', ' + sensor if sensors > 1 else ''}"
+
+
+def row_label(agent: str) -> str:
+    """Name a row as the paper does, with its measure.
+
+    Example:
+        >>> row_label("rcdsac_pow"), row_label("sac"), row_label("mine")
+        ('RC-DSAC (resample) pow', 'SAC', 'mine')
+    """
+    return " ".join(part for part in _called(agent) if part)
 
 
 def _names() -> pd.DataFrame:

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 from rcdsac_trl.agent.actor import network_of_heads
 from rcdsac_trl.agent.networks import ActorHead, Encoder, HistoryEncoder, NetworkSettings, QuantileHead, ScalarHead
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
-from rcdsac_trl.deploy.policy.weights import AgentConfig, Weights
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
+from rcdsac_trl.deploy.policy.weights import Weights
 
 ACTION_SIZE = 2
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.policy.weights import AgentConfig
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import vector_observations

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.polyline import Polyline, corners
-from rcdsac_trl.deploy.policy.weights import AgentConfig
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.sectors import is_finite_number

@@ -104,7 +104,7 @@ class Policy:
     Attributes:
         config: what the agent is.
         robot: that it drives.
-        record: what its card says of how it drives; empty where it says nothing.
+        measured: what is known of how it drives; None where nothing is.
         fractions: of the quantiles, the midpoints of equal parts of [0, 1], float32 [N].
         default_beta: what ``beta`` is where none is given, the middle of the trained range (-1 for the power law);
             None for an agent that is told none.
@@ -123,7 +123,7 @@ class Policy:
         navigator: "Navigator | None" = None,
     ) -> None:
         self.config = weights.config
-        self.record = weights.record
+        self.measured = weights.measured
         self.robot = self.config.robot
         self.guard = _guard_of(self.robot, guard)
         self.limits = limits
@@ -178,8 +178,9 @@ class Policy:
         elif config.fixed_beta is not None:
             parts.append(f"for beta={config.fixed_beta:g} alone")
         parts.append(f"robot {self.robot.name}")
-        if self.record:
-            collisions, rewards = [r.collisions for r in self.record], [r.reward for r in self.record]
+        if self.measured is not None:
+            conditions = self.measured.conditions
+            collisions, rewards = ([c.metrics[name].mean for c in conditions] for name in ("collisions", "reward"))
             parts.append(f"an episode: collisions {_span(collisions, 2)}, reward {_span(rewards, 0)}")
         return f"Policy({', '.join(parts)})"
 

@@ -8,6 +8,7 @@ import numpy as np
 import rcdsac_trl
 from rcdsac_trl.config.course_settings import CourseSettings
 from rcdsac_trl.deploy import Guard, InputLimits, Policy, shipped_names
+from rcdsac_trl.deploy.policy.registry import HANDFUL
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered
 from rcdsac_trl.evaluation.course.course_drive import Pilot
@@ -51,7 +52,7 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
     """
     runs = settings.runs
     if not runs and settings.baseline is None:
-        runs = tuple(shipped_names())
+        runs = tuple(name for name in HANDFUL if name in shipped_names())
         if not runs:
             raise UserInputError(
                 "no agent is shipped with this version: name who drives with run=<folder> or baseline=pursuit"

@@ -1,0 +1,90 @@
+"""Write the tables of README.md and the pages of docs/ anew that follow from files: ``make tables``.
+
+A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
+``weights/``, and baselines of ``results/``, of which an evaluation is read; that of an accelerator is what
+``benchmarks/accelerator.py`` has written::
+
+    <!-- agents: sac-narrow pursuit-narrow -->
+    | agent | collisions | ..
+    <!-- agents: end -->
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rcdsac_trl.report.card import measured_values
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+_TABLE = re.compile(r"(<!-- agents: (?!end)([^>]*?) -->\n).*?(<!-- agents: end -->)", re.S)
+_ACCELERATOR = re.compile(r"(<!-- accelerator: begin -->\n).*?(<!-- accelerator: end -->)", re.S)
+_HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goals")
+
+
+def renewed(text: str) -> str:
+    """Return a document with its tables as the measured numbers have them."""
+    text = _TABLE.sub(lambda found: found[1] + table_of(found[2].split()) + found[3], text)
+    measured = ROOT / "results" / "accelerator.json"
+    values = json.loads(measured.read_text(encoding="utf-8")) if measured.is_file() else None
+    return _ACCELERATOR.sub(lambda found: found[1] + accelerator_table(values) + found[2], text)
+
+
+def table_of(names: list[str]) -> str:
+    """Return the table of some agents and baselines, Markdown: a row a condition."""
+    rows = [_cells(condition) for name in names for condition in measured_of(name)["conditions"]]
+    lines = [f"| {' | '.join(cells)} |\n" for cells in (_HEADINGS, *rows)]
+    return "".join([lines[0], f"|{'---|' * len(_HEADINGS)}\n", *lines[1:]])
+
+
+def measured_of(name: str) -> Mapping[str, Any]:
+    """Return what was measured of an agent that ships, or of a baseline.
+
+    Raises:
+        SystemExit: if there is neither.
+    """
+    path = ROOT / "weights" / name / "measured.json"
+    if path.is_file():
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return values
+    evaluations = sorted((ROOT / "results" / name).glob("evaluation/*"))
+    if len(evaluations) != 1:
+        raise SystemExit(f"{name} is neither in weights/ nor, with one evaluation, in results/: correct the comment")
+    return measured_values(evaluations[0])
+
+
+def _cells(condition: Mapping[str, Any]) -> list[str]:
+    metrics = condition["metrics"]
+    collisions, reward = (
+        f"{of['mean']:{form}} [{of['low']:{form}}, {of['high']:{form}}]"
+        for of, form in ((metrics["collisions"], ".2f"), (metrics["reward"], ".0f"))
+    )
+    free, goals = metrics["collision_free"]["mean"], metrics["goals"]["mean"]
+    return [condition["label"], collisions, reward, f"{100 * free:.0f} %", f"{goals:.2f}"]
+
+
+def accelerator_table(values: Mapping[str, Any] | None) -> str:
+    """Return what was measured of an accelerator, Markdown: a row a number.
+
+    Args:
+        values: what ``benchmarks/accelerator.py`` has written; None: nobody has called it where there is one.
+    """
+    if values is None:
+        return "No machine with a GPU was at hand yet: all of it is unmeasured.\n"
+    rows = [
+        (part, name.replace("_", " "), f"{value:.4g}" if isinstance(value, float) else str(value))
+        for part, found in values.items()
+        if isinstance(found, Mapping)
+        for name, value in found.items()
+    ]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in (("part", "", ""), ("---",) * 3, *rows))
+
+
+if __name__ == "__main__":
+    for document in DOCUMENTS:
+        text = document.read_text(encoding="utf-8")
+        if (new := renewed(text)) != text:
+            document.write_text(new, encoding="utf-8")
+            print(f"{document.relative_to(ROOT)}: written anew")
