@@ -60,6 +60,8 @@ class Export:
         for name, content in (exported.files | training | packed(self.weights)).items():
             atomic.write(self.out / name, content)
         print(f"wrote {self.out}")
+        if (acting := self.weights.config.acting).chooses:
+            print(f"its programs act by tanh(mean); the choice among {acting.num_candidates} actions is Policy's alone")
         return found
 
 
@@ -73,7 +75,7 @@ def make_export(cfg: DictConfig) -> Export:
     check_extra()
     assert settings.run is not None
     agent = named_agent(settings.run, settings.checkpoint)
-    weights = agent.weights()
+    weights = settings.acting.in_weights(agent.weights())
     out = agent.out / "export" / agent.stem if settings.out is None else Path(settings.out)
     check_writable(out)
     if out.is_dir() and any(out.iterdir()):

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
+from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.measured import Measured, measured_of
 from rcdsac_trl.deploy.policy.model_card import limits_of
 from rcdsac_trl.deploy.policy.registry import agent_name
@@ -144,14 +145,14 @@ def make_publication(cfg: DictConfig) -> Publication:
                 f"{run} is an agent that was exported, and what is published are the tables of its run, too: name the "
                 "run folder"
             )
-        weights = weights_of_run(run, settings.checkpoint)
+        weights = settings.acting.in_weights(weights_of_run(run, settings.checkpoint))
         config = weights.config
         robot = None if config.robot == PAPER else config.robot.name
         name = agent_name(config.name, config.fixed_beta, config.sensor, robot)
         if name in agents:
             raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
         small = halved(weights)
-        evaluation, as_shipped = _evaluation_of(run, settings.checkpoint, _digest(small))
+        evaluation, as_shipped = _evaluation_of(run, settings.checkpoint, _digest(small), config.acting)
         calibration = _calibration_of(run, settings.checkpoint)
         agents[name] = Published(run, weights, small, agent.training, evaluation, as_shipped, calibration)
     for folder in (Path(settings.weights), Path(settings.results)):
@@ -167,16 +168,18 @@ def _digest(small: Weights) -> str:
     return sha256(stored(small, half=True)).hexdigest()
 
 
-def _evaluation_of(run: Path, checkpoint: Name, digest: str) -> tuple[Path, bool]:
+def _evaluation_of(run: Path, checkpoint: Name, digest: str, acting: ActingSettings) -> tuple[Path, bool]:
     """Return the evaluation of a run that is published, and whether it drove the weights that ship.
 
-    It is of that checkpoint, on evaluation maps, of the agent alone. One on the default maps and task comes before
-    others, for they are what agents compare on; then one of the weights as they ship, then that with most episodes.
+    It is of that checkpoint, on evaluation maps, of the agent alone, which acted as the one that is published does. One
+    on the default maps and task comes before others, for they are what agents compare on; then one of the weights as
+    they ship, then that with most episodes.
 
     Args:
         run: its folder.
         checkpoint: of the agent.
         digest: SHA-256 of the weights that ship.
+        acting: of the agent that ships.
 
     Raises:
         UserInputError: if there is none.
@@ -187,7 +190,7 @@ def _evaluation_of(run: Path, checkpoint: Name, digest: str) -> tuple[Path, bool
     for path in sorted(run.glob("evaluation/*/evaluation.json")):
         described = json.loads(path.read_bytes())
         measured = described["checkpoint"], described["split"]
-        if measured != (checkpoint, "evaluation") or _is_helped(described):
+        if measured != (checkpoint, "evaluation") or _is_helped(described) or not _acted(described, acting):
             continue
         driven = described.get("weights_sha256")
         if driven not in (None, digest):
@@ -197,10 +200,19 @@ def _evaluation_of(run: Path, checkpoint: Name, digest: str) -> tuple[Path, bool
         found[path.parent] = ((described["map"], described["task"]) == default, driven == digest, number)
     if not found:
         called = f"{program()} evaluate {assigned('run', run.as_posix())} checkpoint={checkpoint} half_precision=true"
+        called += "".join(f" acting.{name}={value}" for name, value in asdict(acting).items() if acting.chooses)
         stale = f" ({others} are of other weights: it was trained on)" if others else ""
-        raise UserInputError(f"{run} has no evaluation of its checkpoint {checkpoint}{stale}: {called}")
+        raise UserInputError(
+            f"{run} has no evaluation of its checkpoint {checkpoint} that acts by {acting}{stale}: {called}"
+        )
     best = max(found, key=lambda folder: found[folder])
     return best, found[best][1]
+
+
+def _acted(described: Mapping[str, Any], acting: ActingSettings) -> bool:
+    """Tell whether an evaluation was driven so; those of earlier versions do not say it: they took tanh(mean)."""
+    acted = ActingSettings(**(described.get("acting") or {}))
+    return acted == acting if acting.chooses else not acted.chooses
 
 
 def _is_helped(described: Mapping[str, Any]) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from rcdsac_trl.deploy import Policy, Weights
+from rcdsac_trl.deploy.policy.acting import BY_MEAN
 from rcdsac_trl.errors import FaultError
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.seeding import stream
@@ -35,7 +36,8 @@ def largest_differences(one: Weights, other: Weights, steps: int = STEPS) -> dic
         expect, where they have any.
     """
     rng = stream(0, "publish")
-    policies = [Policy(_without_dead_band(weights), guard=None) for weights in (one, other)]
+    # Of the mean: a choice among actions may fall otherwise where two are worth the same.
+    policies = [Policy(_without_dead_band(weights), guard=None, acting=BY_MEAN) for weights in (one, other)]
     largest = dict.fromkeys(LIMITS, 0.0)
     for context in _contexts(one):
         for policy in policies:

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.look_ahead import foreseen_among, read_by_heads, told_of_action
 from rcdsac_trl.robot.observation import RangeCode, vector_observations
@@ -51,6 +52,7 @@ class AgentConfig:
         look_ahead: its heads read the foreseen clearances, and critics those of their action; see
             :mod:`rcdsac_trl.robot.look_ahead`.
         robot: that it was trained to drive; plain values of one, as files have them, are read.
+        acting: how it acts, by tanh(mean) or by its critics' choice; plain values are read, too.
 
     Raises:
         UserInputError: if values do not fit together.
@@ -76,11 +78,14 @@ class AgentConfig:
     restart_steps: int | None = None
     look_ahead: bool = False
     robot: RobotSettings = PAPER
+    acting: ActingSettings = BY_MEAN
 
     def __post_init__(self) -> None:
         """Refuse what no agent can be."""
         if not isinstance(self.robot, RobotSettings):
             object.__setattr__(self, "robot", RobotSettings.from_mapping(self.robot))
+        if not isinstance(self.acting, ActingSettings):
+            object.__setattr__(self, "acting", ActingSettings(**self.acting))
         for name in ("context_range", "embedding", "period_s"):
             value = getattr(self, name)
             if value is None:

@@ -80,6 +80,7 @@ policy = rcdsac_trl.load("this/folder")
 | is told | {told} |
 | risk measure | {config.measure} |
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |
+| acts by | {config.acting} |
 | gives | linear velocity in m/s, angular velocity in rad/s |
 {origin}
 {driving}

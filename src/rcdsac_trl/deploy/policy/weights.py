@@ -22,6 +22,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from rcdsac_trl.deploy.policy.acting import BY_MEAN
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.measured import MEASURED_NAME, Measured, read_measured
 from rcdsac_trl.deploy.policy.model_card import model_card
@@ -29,13 +30,15 @@ from rcdsac_trl.deploy.policy.registry import CONFIG_NAME
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import PAPER
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
-_UNSAID_BY_3: dict[str, Any] = {"restart_steps": None, "look_ahead": False, "robot": PAPER}
+_UNSAID_BY_4: dict[str, Any] = {"acting": BY_MEAN}
+_UNSAID_BY_3: dict[str, Any] = {"restart_steps": None, "look_ahead": False, "robot": PAPER, **_UNSAID_BY_4}
 _UNSAID: dict[int, dict[str, Any]] = {
     1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
     2: {"memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
     3: _UNSAID_BY_3,
+    4: _UNSAID_BY_4,
     FORMAT_VERSION: {},
 }
 WEIGHTS_NAME = "weights.safetensors"
