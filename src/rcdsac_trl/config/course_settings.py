@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from rcdsac_trl.config.acting_override import ActingOverride
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.checks import check_least
@@ -68,6 +69,7 @@ class CourseSettings:
     beta: tuple[float, ...] | None
     baseline: Literal["pursuit"] | None
     guard_margin_m: float | None
+    acting: ActingOverride
     navigation: NavigationSettings
     repetitions: int
     seed: int

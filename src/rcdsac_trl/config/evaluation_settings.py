@@ -5,10 +5,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
+from rcdsac_trl.config.acting_override import ActingOverride
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
 from rcdsac_trl.config.typed import read, section_class
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.system import runtime
@@ -75,6 +77,7 @@ class ExportSettings:
     checkpoint: Name | None
     out: str | None
     num_quantiles: int
+    acting: ActingOverride
 
     def __post_init__(self) -> None:
         """Refuse an export of nothing."""
@@ -118,6 +121,7 @@ class EvaluationSettings:
     num_maps: int
     num_episodes: int
     sampled: bool
+    acting: ActingOverride
     out: str | None
     num_workers: Workers
     gui: bool
@@ -141,6 +145,8 @@ class EvaluationSettings:
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
         if self.baseline is not None and (self.navigation.replan or self.navigation.watchdog):
             raise UserInputError(f"baseline={self.baseline} navigates by itself: leave navigation out")
+        if self.baseline is not None and self.acting.given:
+            raise UserInputError(f"baseline={self.baseline} has no critics to choose by: leave acting out")
         asked = self.beta_controller or ()
         if asked and self.baseline is not None:
             raise UserInputError(f"baseline={self.baseline} has no beta to turn: leave beta_controller out")
@@ -174,6 +180,22 @@ class EvaluationSettings:
                 f"beta_controller=[{','.join(asked)}] turns beta between the values of beta: give two or more of them"
             )
         return [*fixed, *(Condition(controller=name) for name in asked)]
+
+    def acting_of(self, trained: TrainingSettings) -> ActingSettings:
+        """Return how the agents act: as their run's config says, with what was chosen in its place.
+
+        Raises:
+            UserInputError: if actions are to be drawn and chosen.
+        """
+        if self.run is None:
+            return BY_MEAN
+        acting = self.acting.of(trained.acting)
+        if self.sampled and acting.chooses:
+            raise UserInputError(
+                f"sampled=true draws actions, and acting.num_candidates={acting.num_candidates} chooses among some: "
+                "leave sampled out, or give acting.num_candidates=1"
+            )
+        return acting
 
     def world_of(self, trained: TrainingSettings) -> ChosenWorld:
         """Return map set, sensor, task and robot: those of a training, with what was chosen in their place.
@@ -289,6 +311,7 @@ class PublishSettings:
 
     runs: tuple[str, ...]
     checkpoint: Name
+    acting: ActingOverride
     weights: str
     results: str
 

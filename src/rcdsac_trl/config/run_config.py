@@ -15,6 +15,7 @@ from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.compose import choices
 from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
 from rcdsac_trl.config.typed import read
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
@@ -97,6 +98,7 @@ class AgentOfRun:
     task: TaskSettings
     # Runs of earlier versions name none.
     robot: RobotSettings = PAPER
+    acting: ActingSettings = BY_MEAN
 
 
 def agent_of_run(folder: Path) -> AgentOfRun:
@@ -105,7 +107,7 @@ def agent_of_run(folder: Path) -> AgentOfRun:
     Raises:
         UserInputError: as :func:`settings_of_run`.
     """
-    names = ("algo", "sensor", "network", "task", "robot")
+    names = ("algo", "sensor", "network", "task", "robot", "acting")
     return _of_run(folder, "run", lambda values: read(AgentOfRun, {n: values[n] for n in names if n in values}))
 
 

@@ -12,6 +12,7 @@ from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
 from rcdsac_trl.config.schedule import Schedule
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system import runtime
@@ -135,6 +136,8 @@ class TrainingSettings:
     robot: RobotSettings = PAPER
     # Those began with random weights.
     init: str | None = None
+    # Those acted by tanh(mean).
+    acting: ActingSettings = BY_MEAN
 
     def __post_init__(self) -> None:
         """Refuse what does not fit together, or not this machine."""

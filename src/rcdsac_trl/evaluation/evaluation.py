@@ -1,4 +1,4 @@
-"""Evaluation: the same maps, starts and goals for every agent, deterministic actions, one row an episode."""
+"""Evaluation: the same maps, starts and goals for every agent, its mean actions or its choice, one row an episode."""
 
 from collections.abc import Generator
 from dataclasses import asdict, replace
@@ -120,6 +120,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: Chose
         baseline=settings.baseline or PURSUIT,
         one_trip=chosen.barn is not None,
         navigation=settings.navigation,
+        acting=settings.acting_of(trained),
     )
 
 
@@ -136,6 +137,7 @@ def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: Name
             name = f"{spec.world.robot.name}-{name}"
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
     name += "".join(f"-{part}" for part, is_on in asdict(spec.navigation).items() if is_on)
+    name += "".join(f"-{part}_{value}" for part, value in settings.acting.given.items())
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
     return named.folder_of("evaluation", f"{name}{contexts}")
 
@@ -158,6 +160,7 @@ def _described(
         "num_maps": num_maps,
         "num_episodes": settings.num_episodes,
         "sampled": settings.sampled,
+        "acting": None if named is None else asdict(spec.acting),
         "navigation": asdict(settings.navigation),
         "conditions": [str(condition) for condition in spec.conditions],
         "map": asdict(spec.world.map_settings),

@@ -73,7 +73,7 @@ def make_export(cfg: DictConfig) -> Export:
     check_extra()
     assert settings.run is not None
     agent = named_agent(settings.run, settings.checkpoint)
-    weights = agent.weights()
+    weights = settings.acting.in_weights(agent.weights())
     out = agent.out / "export" / agent.stem if settings.out is None else Path(settings.out)
     check_writable(out)
     if out.is_dir() and any(out.iterdir()):

@@ -3,7 +3,7 @@
 import math
 import sys
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -155,9 +155,9 @@ class ExportedAgent(NamedAgent):
 
     @cached_property
     def settings(self) -> TrainingSettings:
-        """What it was trained with."""
-        settings = settings_of_export(self.folder)
+        """What it was trained with; how it acts may have been chosen when it was exported."""
         config = self.read.config
+        settings = replace(settings_of_export(self.folder), acting=config.acting)
         if agent_config(settings, settings.learner.num_critics, config.provenance) != config:
             raise UserInputError(f"{self.folder}: {TRAINING_NAME} is of another agent than the weights: export it anew")
         return settings

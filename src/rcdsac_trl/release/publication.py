@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -11,6 +11,7 @@ from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy import Policy
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.deploy.policy.weights import Weights, halved, packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import RunAgent, named_agent
@@ -105,12 +106,12 @@ def make_publication(cfg: DictConfig) -> Publication:
                 f"{run} is an agent that was exported, and what is published are the tables of its run, too: name the "
                 "run folder"
             )
-        weights = weights_of_run(run, settings.checkpoint)
+        weights = settings.acting.in_weights(weights_of_run(run, settings.checkpoint))
         config = weights.config
         name = f"{config.name}-{config.sensor}" + ("" if config.robot == PAPER else f"-{config.robot.name}")
         if name in agents:
             raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
-        agents[name] = Published(run, weights, agent.training, _evaluation_of(run, settings.checkpoint))
+        agents[name] = Published(run, weights, agent.training, _evaluation_of(run, settings.checkpoint, config.acting))
     for folder in (Path(settings.weights), Path(settings.results)):
         check_writable(folder)
         for name in agents:
@@ -119,8 +120,10 @@ def make_publication(cfg: DictConfig) -> Publication:
     return Publication(agents, Path(settings.weights), Path(settings.results))
 
 
-def _evaluation_of(run: Path, checkpoint: Name) -> Path:
+def _evaluation_of(run: Path, checkpoint: Name, acting: ActingSettings) -> Path:
     """Return the evaluation of a run that is published: of that checkpoint, on evaluation maps, with most episodes.
+
+    The agent acted in it as the one that is published does.
 
     Raises:
         UserInputError: if there is none.
@@ -129,12 +132,16 @@ def _evaluation_of(run: Path, checkpoint: Name) -> Path:
     for path in sorted(run.glob("evaluation/*/evaluation.json")):
         described = json.loads(path.read_bytes())
         measured = described["checkpoint"], described["split"]
-        if measured == (checkpoint, "evaluation") and not described.get("controller"):
+        # Evaluations of earlier versions do not say it: they took tanh(mean).
+        acted = ActingSettings(**(described.get("acting") or {}))
+        is_so = not acted.chooses if not acting.chooses else acted == acting
+        if measured == (checkpoint, "evaluation") and is_so and not described.get("controller"):
             found[path.parent] = described["num_maps"] * described["num_episodes"]
     if not found:
         raise UserInputError(
-            f"{run} has no evaluation of its checkpoint {checkpoint}: "
-            f"{program()} evaluate {assigned('run', run.as_posix())} checkpoint={checkpoint}"
+            f"{run} has no evaluation of its checkpoint {checkpoint} that acts by {acting}: "
+            f"{program()} evaluate {assigned('run', run.as_posix())} checkpoint={checkpoint} "
+            + " ".join(f"acting.{name}={value}" for name, value in asdict(acting).items())
         )
     return max(found, key=lambda folder: found[folder])
 
@@ -142,7 +149,8 @@ def _evaluation_of(run: Path, checkpoint: Name) -> Path:
 def _largest_difference(one: Weights, other: Weights) -> float:
     """Return how far the speeds differ at most, m/s, that two agents want where they see the same."""
     rng = stream(0, "publish")
-    policies = [Policy(weights, guard=None) for weights in (one, other)]
+    # Of the mean: a choice among actions may fall otherwise where two are worth the same.
+    policies = [Policy(weights, guard=None, acting=BY_MEAN) for weights in (one, other)]
     largest = 0.0
     for _ in range(_STEPS):
         ranges = rng.uniform(0.3, 6.0, NUM_BINS)

@@ -126,6 +126,7 @@ def agent_config(
         restart_steps=agent.network.restart_steps,
         look_ahead=agent.network.look_ahead,
         robot=agent.robot,
+        acting=agent.acting,
     )
 
 

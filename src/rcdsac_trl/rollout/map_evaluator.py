@@ -17,8 +17,10 @@ from rcdsac_trl.config.evaluation_settings import ControllerSettings
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.navigation.navigator import Navigator
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.rollout.beta_control import AdaptivePolicy
+from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy
 from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
 from rcdsac_trl.rollout.environments import evaluation_worker
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows
@@ -61,6 +63,7 @@ class EvaluationSpec:
         baseline: what drives where there is no actor.
         one_trip: drive to the first goal alone; see :func:`~rcdsac_trl.rollout.measurement.measure_map`.
         navigation: what navigates around the agents.
+        acting: by tanh(mean) or by the critics' choice.
     """
 
     trained: TrainingSettings
@@ -77,6 +80,7 @@ class EvaluationSpec:
     baseline: str = PURSUIT
     one_trip: bool = False
     navigation: NavigationSettings = field(default_factory=NavigationSettings)
+    acting: ActingSettings = BY_MEAN
 
 
 class Agent(NamedTuple):
@@ -100,7 +104,8 @@ def map_evaluator(
     Args:
         spec: what is driven.
         actor: the actor's weights, packed; None: the baseline drives, which is told nothing.
-        loss: the loss with the critics, packed; read where a condition's controller needs their quantiles.
+        loss: the loss with the critics, packed; read where these choose actions, or a condition's controller needs
+            their quantiles.
         wrap: puts something around the policy, which may change nothing of what it does.
     """
     threads = torch.get_num_threads()
@@ -117,6 +122,8 @@ def map_evaluator(
         )
     else:
         policy = _policy(spec, actor, noise)
+        if spec.acting.chooses:
+            policy = _choosing(spec, policy, loss)
     planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
     advised_noise = AgentNoise(agent_ids)
@@ -152,6 +159,20 @@ def map_evaluator(
     finally:
         worker.close()
         torch.set_num_threads(threads)
+
+
+def _choosing(spec: EvaluationSpec, policy: TensorDictModuleBase, loss: bytes | None) -> ChoosingPolicy:
+    """Let the critics choose among actions around those of a policy."""
+    assert loss is not None
+    algo = spec.trained.algo
+    return ChoosingPolicy(
+        policy,
+        unpacked_loss(spec.trained, loss).critics,
+        spec.acting,
+        measure=algo.distortion.measure,
+        beta=algo.beta,
+        num_agents=spec.num_episodes * len(spec.conditions),
+    )
 
 
 def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, noise: AgentNoise) -> NavigatedPolicy:

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from rcdsac_trl.agent.kernels import dispatch
-from rcdsac_trl.deploy.policy.policy import fractions_of
+from rcdsac_trl.deploy.policy.distortion import fractions_of
 
 NUM_QUANTILES = 16
 """Quantiles that are read of a prediction; a :class:`rcdsac_trl.deploy.Policy` tells as many."""

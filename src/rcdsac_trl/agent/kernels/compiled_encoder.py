@@ -203,9 +203,9 @@ def copied(tensors: dict[str, Tensor]) -> dict[str, Floats]:
 class WeightsOfNow(Generic[Copy]):
     """A copy of layers' weights, made anew when they have changed.
 
-    They are copied whenever an episode begins, and whenever an operation has changed one of them in place, which PyTorch
-    counts. It does not count fused optimisers and what is written past it, as TorchRL's checkpoints do: what they change
-    within an episode holds from the next one on.
+    They are copied whenever an episode begins, and whenever an operation has changed one of them in place, which
+    PyTorch counts. It does not count fused optimisers and what is written past it, as TorchRL's checkpoints do: what
+    they change within an episode holds from the next one on.
 
     Args:
         layers: whose parameters are watched.

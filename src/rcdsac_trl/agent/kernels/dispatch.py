@@ -6,12 +6,13 @@ on a CPU, in single or double precision. Everything else runs its own layers: an
 layer put into ours, another device, a compiler or an exporter.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from rcdsac_trl.agent.kernels.compiled_encoder import CompiledEncoder
 from rcdsac_trl.agent.kernels.observation_features import observation_features
 from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
 from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
@@ -55,6 +56,14 @@ def step(encoder: HistoryEncoder, range_: Tensor, *rest: Tensor) -> tuple[Tensor
     features = _features(encoder, [value.reshape(-1, value.shape[-1]) for value in (range_, *vectors)])
     memory, after = encoder.advance(features.view(*lead, -1), is_init, state)
     return encoder.with_foreseen(memory, vectors), after
+
+
+def one_by_one(encoder: HistoryEncoder) -> Callable[..., tuple[Tensor, Tensor]]:
+    """Return what does ``encoder.step`` for a handful of agents ``[N]`` on a CPU.
+
+    The compiled twin computes an agent's numbers from its own row alone; the layers of others need not.
+    """
+    return CompiledEncoder(encoder).step if _is_plain_encoder(encoder) else encoder.step  # type: ignore[arg-type]
 
 
 def has_compiled_actor(encoder: nn.Module, head: nn.Module) -> bool:

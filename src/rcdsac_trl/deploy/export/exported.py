@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rcdsac_trl.deploy.export.modules import ACTION_SIZE, ActorStep, CriticStep, network_of
+from rcdsac_trl.deploy.policy.distortion import fractions_of
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
-from rcdsac_trl.deploy.policy.policy import fractions_of
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MAX_RANGE_OBSERVATION, REMEMBERED_SIZE, vector_observations

@@ -40,7 +40,7 @@ class Outlook:
     """What an agent would do where it is, and what it expects of that.
 
     Attributes:
-        action: tanh(mean), or the action that was asked about, in [-1, 1], float32 [2].
+        action: what it would do, or the action that was asked about, in [-1, 1], float32 [2].
         wanted: the velocities of that action, (m/s, rad/s).
         quantiles: of the return for it, at ``Policy.fractions``, the lower of the critics' each, float32 [N]; None
             where the critics know the mean alone.

@@ -174,12 +174,13 @@ class Actor:
         self._gate = _linear(parts, "gate") if "gate.weight" in parts[0] else None
 
     def action(self, read: Array, embedded: float | None, noise: Array | None = None) -> Array:
-        """Return an action, [2]: tanh(mean), or a drawn one.
+        """Return an action, [2]: tanh(mean), or one beside it; or several of these, [K, 2].
 
         Args:
             read: [n], see :meth:`Encoders.heads_read`.
             embedded: ``beta`` in [0, 1]; None where the networks read none.
-            noise: standard normal numbers to draw it with, [2]; None: the mean is meant.
+            noise: added to the mean, in standard deviations of the policy, [2] or [K, 2]: an action is drawn with
+                standard normal numbers. None: the mean is meant.
         """
         x = _rectified(read[None], self._input)
         if self._gate is not None and embedded is not None:
@@ -206,11 +207,9 @@ class Critics:
         self._input, self._hidden, self._output = (_linear(parts, name) for name in ("input", "hidden", "output"))
         told = "gate_beta.weight" in parts[0]
         self._beta = _transposed(parts, "gate_beta.weight") if told else None
-        self._gate: Array | None = None
-        if "gate_tau.weight" in parts[0]:
-            # The fractions never change: neither does their half of the gate, [C, N, head].
-            weight, bias = _linear(parts, "gate_tau")
-            self._gate = np.concatenate([_cosines(float(tau), self._angles) for tau in fractions]) @ weight + bias
+        self._tau = _linear(parts, "gate_tau") if "gate_tau.weight" in parts[0] else None
+        # The fractions never change: neither does their half of the gates.
+        self._of_fractions = self.of_fractions(fractions)
 
     def values(self, read: Array, action: Array, embedded: float | None) -> Array:
         """Return the lower of the critics' quantiles each, [N], or of scalar critics' means, [1].
@@ -232,22 +231,56 @@ class Critics:
             actions: [K, 2].
             embedded: ``beta`` in [0, 1]; None where the networks read none.
         """
+        values = self._values(read, actions, self.gate(self._of_fractions, embedded))
+        # Networks may cross their quantiles a little; in rising order they are never farther from the true ones.
+        return np.minimum.reduce(np.sort(values, axis=2))
+
+    def means(self, read: Array, actions: Array, gate: Array | None) -> Array:
+        """Return the mean that each critic expects of several actions over the fractions of its gate, [C, K].
+
+        Args:
+            read: of each critic, [C, n].
+            actions: [K, 2].
+            gate: from :meth:`gate`.
+        """
+        return self._values(read, actions, gate).mean(axis=2)
+
+    def of_fractions(self, fractions: Array) -> Array | None:
+        """Return the half of critics' gates that fractions [N] in [0, 1] make, [C, N, head]; None of scalar ones."""
+        if self._tau is None:
+            return None
+        weight, bias = self._tau
+        of_fractions: Array = np.concatenate([_cosines(float(tau), self._angles) for tau in fractions]) @ weight + bias
+        return of_fractions
+
+    def gate(self, of_fractions: Array | None, embedded: float | None) -> Array | None:
+        """Return each critic's gates at some fractions, [C, N, head]; None of scalar critics.
+
+        Args:
+            of_fractions: from :meth:`of_fractions`.
+            embedded: ``beta`` in [0, 1]; None where the networks read none.
+        """
+        if of_fractions is None:
+            return None
+        gate = of_fractions
+        if self._beta is not None and embedded is not None:
+            gate = gate + _cosines(embedded, self._angles) @ self._beta
+        return np.maximum(gate, _ZERO)
+
+    def _values(self, read: Array, actions: Array, gate: Array | None) -> Array:
+        """Return each critic's quantiles of several actions as they come, [C, K, N], or [C, K, 1] of scalar critics."""
         told = np.concatenate((actions, look_ahead(read[0], actions)), axis=1) if self._looks_ahead else actions
         critics, size = read.shape
         joined = np.empty((critics, len(told), size + told.shape[1]), dtype=np.float32)
         joined[:, :, :size], joined[:, :, size:] = read[:, None], told
         x = _rectified(joined, self._input)
-        if self._gate is not None:
-            gate = self._gate
-            if self._beta is not None and embedded is not None:
-                gate = gate + _cosines(embedded, self._angles) @ self._beta
-            gated = x[:, :, None] * np.maximum(gate, _ZERO)[:, None]
+        if gate is not None:
+            gated = x[:, :, None] * gate[:, None]
             x = gated.reshape(critics, -1, gated.shape[-1])
         weight, bias = self._output
         values = _rectified(x, self._hidden) @ weight
         values += bias
-        # Networks may cross their quantiles a little; in rising order they are never farther from the true ones.
-        return np.minimum.reduce(np.sort(values.reshape(critics, len(told), -1), axis=2))
+        return values.reshape(critics, len(told), -1)
 
 
 def _rectified(x: Array, layer: tuple[Array, Array]) -> Array:

@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.policy.acting import ActingSettings
+from rcdsac_trl.deploy.policy.action_choice import ActionChoice
 from rcdsac_trl.deploy.policy.command import Command, Outlook
+from rcdsac_trl.deploy.policy.distortion import fractions_of
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.policy.input_checks import (
     BadInputError,
@@ -28,7 +31,7 @@ from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.robot_settings import RobotSettings
-from rcdsac_trl.robot.sectors import Sectors, is_finite_number, is_whole_number
+from rcdsac_trl.robot.sectors import Sectors, is_finite_number
 from rcdsac_trl.seeding import stream
 
 if TYPE_CHECKING:
@@ -40,17 +43,6 @@ if TYPE_CHECKING:
 _FORGET_AFTER = 3
 _RECOVERS = "it stands until good input comes"
 _AT_ORIGIN = (0.0, 0.0, 0.0)
-
-
-def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
-    """Return the midpoints of equal parts of [0, 1], float32 [num_quantiles].
-
-    Raises:
-        UserInputError: if the number is no whole one of 1 or more.
-    """
-    if not (is_whole_number(num_quantiles) and num_quantiles >= 1):
-        raise UserInputError(f"num_quantiles={num_quantiles} is no whole number of 1 or more: ask for at least one")
-    return ((np.arange(num_quantiles) + 0.5) / num_quantiles).astype(np.float32)
 
 
 def _span(values: Sequence[float], digits: int) -> str:
@@ -100,6 +92,7 @@ class Policy:
         num_quantiles: at how many fractions the return's distribution is told.
         navigator: hands out other waypoints where the way is blocked, and helps where the robot gets nowhere; None:
             the agent is on its own.
+        acting: by the actor's mean or by the critics' choice among some actions; None: as the agent's config says.
 
     Attributes:
         config: what the agent is.
@@ -110,7 +103,7 @@ class Policy:
             None for an agent that is told none.
 
     Raises:
-        UserInputError: if the guard is another robot's.
+        UserInputError: if the guard is another robot's, or the critics are to choose by a measure of your own.
     """
 
     def __init__(
@@ -121,6 +114,7 @@ class Policy:
         limits: InputLimits = InputLimits(),  # noqa: B008 (frozen)
         num_quantiles: int = 16,
         navigator: "Navigator | None" = None,
+        acting: ActingSettings | None = None,
     ) -> None:
         self.config = weights.config
         self.record = weights.record
@@ -146,6 +140,7 @@ class Policy:
         )
         self._actor = Actor(weights)
         self._critics = Critics(weights, self.fractions)
+        self.acting = weights.config.acting if acting is None else acting
         self._halted = False
         self._states: Array
         self._read: Array
@@ -178,6 +173,8 @@ class Policy:
         elif config.fixed_beta is not None:
             parts.append(f"for beta={config.fixed_beta:g} alone")
         parts.append(f"robot {self.robot.name}")
+        if self.acting.chooses:
+            parts.append(f"chooses among {self.acting.num_candidates} actions")
         if self.record:
             collisions, rewards = [r.collisions for r in self.record], [r.reward for r in self.record]
             parts.append(f"an episode: collisions {_span(collisions, 2)}, reward {_span(rewards, 0)}")
@@ -190,6 +187,20 @@ class Policy:
         own["_others"] = [copy.copy(other) for other in self._others]
         copied.__dict__ |= self.__dict__ | own
         return copied
+
+    @property
+    def acting(self) -> ActingSettings:
+        """How it acts: by tanh(mean), or by its critics' choice among some actions. It may be changed.
+
+        Raises:
+            UserInputError: if the critics are to choose by a risk measure that is known to torch alone.
+        """
+        return self._acting
+
+    @acting.setter
+    def acting(self, acting: ActingSettings) -> None:
+        self._choice = ActionChoice(acting, self.config, self._actor, self._critics) if acting.chooses else None
+        self._acting = acting
 
     @property
     def world(self) -> dict[str, Any]:
@@ -274,13 +285,13 @@ class Policy:
             raise UserInputError(
                 f"the memory of {self.config.name} depends on its collision weight: call act() instead"
             )
-        embedded = self._embedded(self.check_beta(beta))
+        context = self.check_beta(beta)
         if action is None:
-            return self._outlook(embedded)
+            return self._outlook(context)
         asked = numbers_of(action, "action").astype(np.float32)
         if asked.shape != (2,) or not np.all(np.abs(asked) <= 1.0):
             raise UserInputError(f"action={action} is not two numbers from -1 to 1: give u_0 and u_1")
-        return self._outlook(embedded, asked)
+        return self._outlook(context, asked)
 
     def outlooks(self, actions: NDArray[np.float32], beta: float | None = None) -> NDArray[np.float32]:
         """Return what the critics expect of many actions where the agent stands now, as :meth:`foresee` of each.
@@ -430,12 +441,11 @@ class Policy:
         self._states = self._encoders.step(bins, told, self._states)
         self._read = self._encoders.heads_read(self._states, told)
         self._steps += 1
-        embedded = self._embedded(context)
         drawn = None
         if self._advice is not None and self._advice.draws:
             noise = self._noise.standard_normal(2, np.float32)
-            drawn = self._actor.action(self._read[0], embedded, noise)
-        outlook = self._outlook(embedded, drawn)
+            drawn = self._actor.action(self._read[0], self._embedded(context), noise)
+        outlook = self._outlook(context, drawn)
         self._wanted = outlook.wanted
         self._told = outlook.quantiles, outlook.value
         return outlook
@@ -446,9 +456,16 @@ class Policy:
             return None
         return self.config.embedding[0] * context + self.config.embedding[1]
 
-    def _outlook(self, embedded: float | None, action: Array | None = None) -> Outlook:
+    def _chosen(self, context: float | None, embedded: float | None) -> Array:
+        """Return what the agent does where it stands, [2]."""
+        if self._choice is None:
+            return self._actor.action(self._read[0], embedded)
+        return self._choice.best(self._read, context if self.config.context == "beta" else None, embedded)
+
+    def _outlook(self, context: float | None, action: Array | None = None) -> Outlook:
+        embedded = self._embedded(context)
         if action is None:
-            action = self._actor.action(self._read[0], embedded)
+            action = self._chosen(context, embedded)
         lower = self._critics.values(self._read[1:], action, embedded)
         quantiles = lower if self.config.critic == "quantile" else None
         told = lower.tolist()  # of so few, Python's sum is the fastest mean

@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.deploy.policy.driving_record import DrivingRecord, driving_record
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.look_ahead import foreseen_among, read_by_heads, told_of_action
@@ -29,13 +30,15 @@ from rcdsac_trl.robot.range_sensor import NUM_BINS, SENSORS, check_memory
 from rcdsac_trl.robot.ring import KERNELS, RING_ENDS, Padding, num_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 """What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
-_UNSAID_BY_3: dict[str, Any] = {"restart_steps": None, "look_ahead": False, "robot": PAPER}
+_UNSAID_BY_4: dict[str, Any] = {"acting": BY_MEAN}
+_UNSAID_BY_3: dict[str, Any] = {"restart_steps": None, "look_ahead": False, "robot": PAPER, **_UNSAID_BY_4}
 _UNSAID: dict[int, dict[str, Any]] = {
     1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
     2: {"memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
     3: _UNSAID_BY_3,
+    4: _UNSAID_BY_4,
     FORMAT_VERSION: {},
 }
 CONFIG_NAME = "config.json"
@@ -80,6 +83,7 @@ class AgentConfig:
         look_ahead: its heads read the foreseen clearances, and critics those of their action; see
             :mod:`rcdsac_trl.robot.look_ahead`.
         robot: that it was trained to drive; plain values of one, as files have them, are read.
+        acting: how it acts, by tanh(mean) or by its critics' choice; plain values are read, too.
 
     Raises:
         UserInputError: if values do not fit together.
@@ -105,11 +109,14 @@ class AgentConfig:
     restart_steps: int | None = None
     look_ahead: bool = False
     robot: RobotSettings = PAPER
+    acting: ActingSettings = BY_MEAN
 
     def __post_init__(self) -> None:
         """Refuse what no agent can be."""
         if not isinstance(self.robot, RobotSettings):
             object.__setattr__(self, "robot", RobotSettings.from_mapping(self.robot))
+        if not isinstance(self.acting, ActingSettings):
+            object.__setattr__(self, "acting", ActingSettings(**self.acting))
         for name in ("context_range", "embedding", "period_s"):
             value = getattr(self, name)
             if value is None:
@@ -395,6 +402,7 @@ policy = rcdsac_trl.load("this/folder")
 | is told | {told} |
 | risk measure | {config.measure} |
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |
+| acts by | {config.acting} |
 | gives | linear velocity in m/s, angular velocity in rad/s |
 {origin}
 {driving}

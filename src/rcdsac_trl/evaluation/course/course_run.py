@@ -108,6 +108,7 @@ def _described(settings: CourseSettings, entries: Sequence[Entry]) -> dict[str, 
     return {
         "entries": [{"run": entry.run, "agent": entry.agent, "beta": entry.beta} for entry in entries],
         "agents": {entry.run: asdict(entry.pilot.config) for entry in entries if isinstance(entry.pilot, Policy)},
+        "acting": {entry.run: asdict(entry.pilot.acting) for entry in entries if isinstance(entry.pilot, Policy)},
         "course_m": COURSE_M,
         "guard_margin_m": settings.guard_margin_m,
         "navigation": asdict(settings.navigation),
@@ -136,7 +137,8 @@ def _default_out(settings: CourseSettings, entries: Sequence[Entry]) -> Path:
         "exact": settings.ranges == "exact",
     }
     eased = "".join(f"-{name}" for name, is_so in ideal.items() if is_so)
-    return folder / f"{who}seed{settings.seed}-{settings.repetitions}x{betas}-guard{margin}{eased}"
+    acting = "".join(f"-{name}_{value}" for name, value in settings.acting.given.items())
+    return folder / f"{who}seed{settings.seed}-{settings.repetitions}x{betas}-guard{margin}{eased}{acting}"
 
 
 @contextlib.contextmanager

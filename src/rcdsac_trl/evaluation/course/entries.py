@@ -64,6 +64,7 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
                 "robot=paper"
             )
         policy.guard = None if settings.guard_margin_m is None else Guard(margin_m=settings.guard_margin_m)
+        policy.acting = settings.acting.of(policy.acting)
         policy.navigator = navigator_of(settings.navigation, policy.robot)
         check_sensor(run, policy, settings.camera.view_deg)
     conditioned = [run for run, policy in policies.items() if policy.config.context == "beta"]

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from rcdsac_trl.colors import CAPTIONS, LIGHT, faded
-from rcdsac_trl.deploy.policy.policy import fractions_of
+from rcdsac_trl.deploy.policy.distortion import fractions_of
 from rcdsac_trl.evaluation.film.recording import Moment
 from rcdsac_trl.evaluation.film.video import Frame
 from rcdsac_trl.world.canvas import font

@@ -1,0 +1,48 @@
+"""What a command may say of how an agent acts, in the place of what the agent's own config says."""
+
+from dataclasses import dataclass, replace
+
+from rcdsac_trl.deploy.policy.acting import ActingSettings, OverCritics
+from rcdsac_trl.deploy.policy.weights import Weights
+
+
+@dataclass(frozen=True)
+class ActingOverride:
+    """``acting`` of the commands that let an agent act; None: as the agent's config says.
+
+    Attributes:
+        num_candidates: as in :class:`~rcdsac_trl.deploy.policy.acting.ActingSettings`.
+        spread: likewise.
+        over_critics: likewise.
+
+    Raises:
+        UserInputError: for what no agent can do.
+    """
+
+    num_candidates: int | None = None
+    spread: float | None = None
+    over_critics: OverCritics | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what lies outside the limits."""
+        self.of(ActingSettings())
+
+    @property
+    def given(self) -> dict[str, int | float | str]:
+        """What is said, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    def of(self, own: ActingSettings) -> ActingSettings:
+        """Return how an agent acts whose own config says that.
+
+        Example:
+            >>> ActingOverride(num_candidates=32).of(ActingSettings(spread=0.5))
+            ActingSettings(num_candidates=32, spread=0.5, over_critics='minimum')
+        """
+        return replace(own, **self.given)  # type: ignore[arg-type]
+
+    def in_weights(self, weights: Weights) -> Weights:
+        """Return an agent that acts so."""
+        if not self.given:
+            return weights
+        return replace(weights, config=replace(weights.config, acting=self.of(weights.config.acting)))
