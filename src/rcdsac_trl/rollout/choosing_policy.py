@@ -19,8 +19,10 @@ class ChoosingPolicy(TensorDictModuleBase):
 
     The value is :math:`\frac1K \sum_j Z_{\psi(\tau_j; \beta)}` at the midpoints of K equal parts of [0, 1], as in the
     actor's loss; scalar critics say the mean. A robot's twin of it is
-    :class:`~rcdsac_trl.deploy.policy.action_choice.ActionChoice`. Agents go through the critics one by one, so that what
-    one does depends, to the last bit, on no other. Critics run on the CPU, wherever the policy does.
+    :class:`~rcdsac_trl.deploy.policy.action_choice.ActionChoice`.
+
+    Agents go through the critics one by one, so that what one does depends, to the last bit, on no other. Critics run
+    on the CPU, wherever the policy does.
 
     Args:
         policy: writes `loc`, `scale` and `action`, the latter tanh(mean).
