@@ -1,7 +1,8 @@
 """What driving costs on one core: time to import and load, and how long one call of a policy takes.
 
 An untrained agent with the default networks drives on made-up messages among random obstacles, so that the stop zone
-has to think in most calls. Torch's modules take turns with the policy on the same observations. Processor time of this
+has to think in most calls; so does one whose critics choose among 32 actions, and both take turns with torch's modules on
+the same observations. Processor time of this
 process, since other programs on the same core are not what is measured; run it with `taskset -c 0`.
 """
 
@@ -18,6 +19,7 @@ import bench_world as bench
 
 CALLS = 3000
 IMPORTS = 5
+CANDIDATES = 32
 _IMPORT = """
 import json, sys, time
 start = time.process_time()
@@ -37,7 +39,7 @@ def main() -> None:
     import numpy as np
     import torch
 
-    from rcdsac_trl.deploy import Guard, Policy, read_weights
+    from rcdsac_trl.deploy import ActingSettings, Guard, Policy, read_weights
     from rcdsac_trl.deploy.export.modules import ActorStep, CriticStep
 
     torch.set_num_threads(1)
@@ -45,16 +47,23 @@ def main() -> None:
         weights_folder = options.weights or untrained(Path(folder))
         imports = [imported(weights_folder) for _ in range(IMPORTS)]
         weights = read_weights(weights_folder)
-    policy, unguarded = Policy(weights), Policy(weights, guard=None)
+    by_mean, choosing = ActingSettings(), ActingSettings(CANDIDATES)
+    policy = Policy(weights, acting=by_mean)
+    drivers = {
+        "act": policy,
+        "act_without_guard": Policy(weights, guard=None, acting=by_mean),
+        "act_choosing": Policy(weights, acting=choosing),
+        "act_choosing_without_guard": Policy(weights, guard=None, acting=choosing),
+    }
     actor, critics = ActorStep.of_weights(weights), CriticStep(weights, torch.from_numpy(policy.fractions))
     memory, memories = torch.zeros(1, actor.encoder.state_size), torch.zeros(2, 1, actor.encoder.state_size)
-    took: dict[str, list[float]] = {"act": [], "act_without_guard": [], "torch_networks_alone": []}
+    took: dict[str, list[float]] = {name: [] for name in (*drivers, "torch_networks_alone")}
     rng = np.random.default_rng(0)
     assert policy.guard == Guard()
     for _ in range(CALLS):
         distances = np.where(rng.random(180) < 0.5, rng.uniform(0.4, 3.0, 180), np.inf)
         waypoints, velocity, beta = rng.uniform(-4, 4, (2, 2)), rng.uniform(-0.2, 0.6, 2), -2.0 * rng.random()
-        for name, driver in (("act", policy), ("act_without_guard", unguarded)):
+        for name, driver in drivers.items():
             start = time.process_time()
             driver.act(distances, waypoints, velocity, beta)
             took[name].append(time.process_time() - start)

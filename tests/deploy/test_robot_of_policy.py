@@ -74,8 +74,8 @@ def test_weights_of_before_drive_the_papers_robot(tmp_path: Path) -> None:
     for name, content in packed(agent()).items():
         (tmp_path / name).write_bytes(content)
     config = json.loads((tmp_path / "config.json").read_bytes())
-    assert config.pop("format_version") == FORMAT_VERSION == 4
-    del config["robot"], config["restart_steps"], config["look_ahead"]
+    assert config.pop("format_version") == FORMAT_VERSION == 5
+    del config["robot"], config["restart_steps"], config["look_ahead"], config["acting"]
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 3}))
     assert read_weights(tmp_path).config == agent().config
     for name in shipped_names():

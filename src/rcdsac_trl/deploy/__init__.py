@@ -3,6 +3,7 @@
 Nothing here needs PyBullet, Hydra, TorchRL or torch, but for :mod:`rcdsac_trl.deploy.export`, which writes ONNX.
 """
 
+from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.beta_controllers import (
     BetaController,
     ClearanceBeta,
@@ -20,6 +21,7 @@ from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.sectors import Mount, Sectors
 
 __all__ = [
+    "ActingSettings",
     "AgentConfig",
     "BetaController",
     "CameraPose",

@@ -1,6 +1,7 @@
 """A replay from its config: what was recorded, who is asked, and the tables of it."""
 
 from collections.abc import Generator, Sequence
+from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,7 @@ def _described(
         "sensor": policy.config.sensor,
         "max_range_m": policy.robot.lidar.max_range_m,
         **agent.described,
+        "acting": asdict(policy.acting),
         "beta": policy.default_beta if settings.beta is None else settings.beta,
         "zero_means": settings.zero_means,
         "nan_means": settings.nan_means,

@@ -60,6 +60,8 @@ class Export:
         for name, content in (exported.files | training | packed(self.weights)).items():
             atomic.write(self.out / name, content)
         print(f"wrote {self.out}")
+        if (acting := self.weights.config.acting).chooses:
+            print(f"its programs act by tanh(mean); the choice among {acting.num_candidates} actions is Policy's alone")
         return found
 
 
