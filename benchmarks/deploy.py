@@ -1,9 +1,9 @@
 """What driving costs on one core: time to import and load, and how long one call of a policy takes.
 
 An untrained agent with the default networks drives on made-up messages among random obstacles, so that the stop zone
-has to think in most calls; so does one whose critics choose among 32 actions, and both take turns with torch's modules on
-the same observations. Processor time of this
-process, since other programs on the same core are not what is measured; run it with `taskset -c 0`.
+has to think in most calls; so does the same agent whose critics choose among 32 actions. Both take turns with torch's
+modules on the same observations. Processor time of this process, since other programs on the same core are not what is
+measured; run it with `taskset -c 0`.
 """
 
 import json

@@ -15,7 +15,8 @@ import pandas as pd
 import pytest
 
 from rcdsac_trl.config.compose import compose
-from rcdsac_trl.config.course_settings import PERIOD_S, OdometrySettings
+from rcdsac_trl.config.course_settings import PERIOD_S, CourseSettings, OdometrySettings
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.deploy import Policy
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
@@ -38,6 +39,7 @@ from rcdsac_trl.evaluation.course.course_drive import (
 )
 from rcdsac_trl.evaluation.course.course_film import frames
 from rcdsac_trl.evaluation.course.course_run import make_course
+from rcdsac_trl.evaluation.course.entries import entries_of
 from rcdsac_trl.evaluation.course.odometry import Odometry
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
 from rcdsac_trl.report.course_table import course_table, paper_course, write_course
@@ -364,6 +366,24 @@ def test_agents_drive_at_what_the_paper_drove_them_at(
     course = make_course(compose("course", given(tmp_path, f"run={run}", *overrides)))
     described = json.loads(course.results.described)
     assert [entry["beta"] for entry in described["entries"]] == entries
+
+
+@pytest.mark.parametrize(
+    ("changes", "overrides", "acting"),
+    [
+        ({}, [], (1, 1.0)),
+        ({"acting": {"num_candidates": 6, "spread": 0.5}}, [], (6, 0.5)),
+        ({"acting": {"num_candidates": 6, "spread": 0.5}}, ["acting.num_candidates=8"], (8, 0.5)),
+    ],
+)
+def test_agents_act_as_they_say_or_as_is_asked_of_them(
+    tmp_path: Path, changes: dict[str, Any], overrides: list[str], acting: tuple[int, float]
+) -> None:
+    run = exported(tmp_path / "agent", **changes)
+    settings = read_config(compose("course", given(tmp_path, f"run={run}", *overrides)), CourseSettings)
+    for entry in entries_of(settings):
+        assert isinstance(entry.pilot, Policy)
+        assert (entry.pilot.acting.num_candidates, entry.pilot.acting.spread) == acting
 
 
 @pytest.mark.parametrize(

@@ -18,10 +18,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from rcdsac_trl.config.acting_override import ActingOverride
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.deploy import shipped_names
+from rcdsac_trl.deploy import read_weights, shipped_names
+from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.rollout import map_evaluator as driver
@@ -100,6 +102,48 @@ def test_sampled_episodes_do_not_depend_on_the_other_betas_nor_on_their_order(ru
     found = episodes("[-2,-1,-0.5]", "a")
     assert episodes("[-0.5,-2,-1]", "b") == found
     assert episodes("[-1]", "c")[-1.0] == found[-1.0]
+
+
+def test_what_critics_choose_does_not_depend_on_who_drives_beside(run: Path, tmp_path: Path) -> None:
+    given = [f"run={run}", "num_maps=2", "acting.num_candidates=6", "acting.spread=1.5"]
+    together = evaluate(*given, "beta=[-2,-1]", f"out={tmp_path / 'a'}", "num_workers=2")
+    alone = evaluate(*given, "beta=[-1]", f"out={tmp_path / 'b'}")
+    by_mean = evaluate(f"run={run}", "num_maps=2", "beta=[-1]", f"out={tmp_path / 'c'}")
+    one = evaluate(f"run={run}", "num_maps=2", "beta=[-1]", "acting.num_candidates=1", f"out={tmp_path / 'd'}")
+    found = pd.read_csv(together / "episodes.csv")
+    rows = [pd.read_csv(out / "episodes.csv") for out in (alone, by_mean)]
+    pd.testing.assert_frame_equal(found[found["beta"] == -1.0].reset_index(drop=True), rows[0], check_exact=True)
+    assert not rows[0].equals(rows[1])
+    assert contents(one) == contents(by_mean)
+    described = json.loads((alone / "evaluation.json").read_text())
+    assert described["acting"] == {"num_candidates": 6, "spread": 1.5, "over_critics": "minimum"}
+
+
+def test_an_exported_agent_acts_as_was_chosen_for_its_export(run: Path, tmp_path: Path) -> None:
+    folder = exported(run, tmp_path / "agent")
+    chosen = ActingOverride(num_candidates=6).in_weights(read_weights(folder))
+    for name, content in packed(chosen).items():
+        (folder / name).write_bytes(content)
+    evaluated = [
+        evaluate(f"run={folder}", "beta=[-1]", f"out={tmp_path / 'a'}"),
+        evaluate(f"run={run}", "beta=[-1]", "acting.num_candidates=6", f"out={tmp_path / 'b'}"),
+    ]
+    assert len({(out / "episodes.csv").read_bytes() for out in evaluated}) == 1
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["sampled=true"], "sampled=true draws actions, and acting.num_candidates=6 chooses among some: leave sampled"),
+        (["acting.spread=0"], "acting.spread=0 must be above 0"),
+        (["acting.over_critics=max"], "acting.over_critics=max must be one of minimum, mean or null"),
+        (["run=null", "baseline=pursuit", "beta=null"], "baseline=pursuit has no critics to choose by"),
+    ],
+)
+def test_what_cannot_choose_is_refused(run: Path, tmp_path: Path, more: list[str], told: str) -> None:
+    with pytest.raises(UserInputError, match=told):
+        evaluate(f"run={run}", "beta=[-1]", "acting.num_candidates=6", f"out={tmp_path / 'out'}", *more)
+    assert not (tmp_path / "out").exists()
 
 
 def test_it_never_mixes_with_what_another_wrote_meanwhile(run: Path, tmp_path: Path) -> None:

@@ -77,7 +77,9 @@ def test_nothing_is_published_twice_or_without_its_evaluation(evaluated: Path, t
         publish(evaluated, tmp_path)
     with pytest.raises(UserInputError, match="are both rcdsac_pow-narrow"):
         make_publication(compose("publish", [f"runs=[{evaluated},{evaluated}]"]))
-    with pytest.raises(UserInputError, match="no evaluation of its checkpoint best"):
+    with pytest.raises(UserInputError, match=r"acts by the best of 6 .* acting.num_candidates=6 acting.spread=1"):
+        make_publication(compose("publish", [f"runs=[{evaluated}]", "acting.num_candidates=6"]))
+    with pytest.raises(UserInputError, match="no evaluation of its checkpoint best that acts by tanh"):
         make_publication(compose("publish", [f"runs=[{evaluated}]", "checkpoint=best"]))
     with pytest.raises(UserInputError, match=r"sac-narrow is an agent that was exported, .* name the run folder"):
         make_publication(compose("publish", ["runs=[sac-narrow]"]))
