@@ -41,6 +41,7 @@ def main() -> None:
 
     from rcdsac_trl.deploy import ActingSettings, Guard, Policy, read_weights
     from rcdsac_trl.deploy.export.modules import ActorStep, CriticStep
+    from rcdsac_trl.robot.observation import REMEMBERED_SIZE
 
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -58,7 +59,7 @@ def main() -> None:
     actor, critics = ActorStep.of_weights(weights), CriticStep(weights, torch.from_numpy(policy.fractions))
     memory, memories = torch.zeros(1, actor.encoder.state_size), torch.zeros(2, 1, actor.encoder.state_size)
     took: dict[str, list[float]] = {name: [] for name in (*drivers, "torch_networks_alone")}
-    rng = np.random.default_rng(0)
+    rng, remembers = np.random.default_rng(0), weights.config.memory_s > 0.0
     assert policy.guard == Guard()
     for _ in range(CALLS):
         distances = np.where(rng.random(180) < 0.5, rng.uniform(0.4, 3.0, 180), np.inf)
@@ -68,10 +69,11 @@ def main() -> None:
             driver.act(distances, waypoints, velocity, beta)
             took[name].append(time.process_time() - start)
         inputs = [torch.from_numpy(rng.random((1, size), dtype=np.float32)) for size in (180, 6, 4, 1)]
+        remembered = torch.from_numpy(rng.random((1, REMEMBERED_SIZE), dtype=np.float32)) if remembers else None
         start = time.process_time()
         with torch.no_grad():
-            action, memory = actor(*inputs, memory)
-            _, memories = critics(*inputs, action, memories)
+            action, memory = actor(*inputs, memory, remembered)
+            _, memories = critics(*inputs, action, memories, remembered)
         took["torch_networks_alone"].append(time.process_time() - start)
     results: dict[str, Any] = {
         "import_and_load_s": min(seconds for seconds, _, _ in imports),

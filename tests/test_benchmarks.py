@@ -65,6 +65,16 @@ def test_evaluation(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     assert found["seconds_for_500_episodes"] > 0
 
 
+def test_deploy(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    program = load("deploy")
+    monkeypatch.setattr(program, "CALLS", 10)
+    monkeypatch.setattr(program, "imported", lambda weights: [1.0, 100, False])
+    run(program, monkeypatch, "--json")
+    found = printed(capsys)
+    drivers = ("act", "act_without_guard", "act_choosing", "act_choosing_without_guard", "torch_networks_alone")
+    assert all(found[f"{name}_median_ms"] > 0 for name in drivers)
+
+
 def test_planners(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     run(load("planners"), monkeypatch, "--json", "--steps=10")
     found = printed(capsys)
