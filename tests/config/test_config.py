@@ -338,7 +338,7 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")
     turned = "beta_controller=[clearance,tail_variance]"
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")
-    evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "out=out")
+    evaluate(f"run={tmp_path / 'rcwr'}", "collision_weight=[1]", "acting.num_candidates=4", "out=out")
     evaluate("baseline=pursuit", "map=easy", "sensor=full", "task=default", "task.episode_steps=5", "robot=jackal")
     write_map_server(tmp_path / "a.yaml", room(80, 80))
     (tmp_path / "b.map").write_text("type octile\nheight 9\nwidth 9\nmap\n" + 9 * (9 * "." + "\n"))

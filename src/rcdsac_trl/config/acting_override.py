@@ -1,6 +1,6 @@
 """What a command may say of how an agent acts, in the place of what the agent's own config says."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 from rcdsac_trl.deploy.policy.acting import ActingSettings, OverCritics
 from rcdsac_trl.deploy.policy.weights import Weights
@@ -30,7 +30,8 @@ class ActingOverride:
     @property
     def given(self) -> dict[str, int | float | str]:
         """What is said, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+        said = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in said.items() if value is not None}
 
     def of(self, own: ActingSettings) -> ActingSettings:
         """Return how an agent acts whose own config says that.

@@ -85,12 +85,12 @@ class ChoosingPolicy(TensorDictModuleBase):
         tau = self.measure.psi(self._tau, risk)
         values = []
         for (_, head), memory in zip(self._critics, memories, strict=True):
-            # As one sequence with one observation, whose gates are computed once.
+            # As one sequence, whose gates are computed once. At this size its plain layers are faster than their twin.
             entries = {
                 head.in_keys[0]: memory.expand(1, len(candidates), -1),
                 "action": candidates.unsqueeze(0),
                 "tau": tau,
                 "risk": risk,
             }
-            values.append(dispatch.forward(head.module, *[entries[key] for key in head.in_keys])[0].mean(-1))
+            values.append(head.module(*[entries[key] for key in head.in_keys])[0].mean(-1))
         return self._over(values)
