@@ -1,6 +1,7 @@
 """Reports: the paper's own averages, refusals, and a whole report of made-up evaluations."""
 
 import json
+import re
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import get_args
 import numpy as np
 import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import __main__ as command
@@ -17,6 +19,7 @@ from rcdsac_trl.report.evaluation_summary import summarised
 from rcdsac_trl.report.figures import collision_causes, learning_curves
 from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.results import Results
 from rcdsac_trl.report.write import write_report
 from rcdsac_trl.world.maps.shapes import Kind
 
@@ -112,7 +115,7 @@ def test_our_cells_are_mean_and_deviation_over_all_episodes(tmp_path: Path) -> N
     evaluate(tmp_path / "c", "mine", {NONE: 0}, sensor="full")
     shown = table.comparison(read_episodes([tmp_path / name for name in "abc"]))
     assert shown[("", "agent")].tolist() == ["RC-DSAC (resample)", "RC-DSAC (resample)", "RCWR", "mine"]
-    assert shown[("", "β")].tolist() == ["-2", "-1", "w_coll = 1.5", ""]
+    assert shown[("", "β or weight")].tolist() == ["-2", "-1", "w_coll = 1.5", ""]
     assert shown[("narrow", "collisions")].tolist() == ["1.00 ± 0.82", "2.00 ± 0.82", "1.00 ± 0.82", ""]
     assert shown[("narrow", "collisions, paper")].tolist() == ["0.50 ± 0.84", "0.58 ± 1.36", "1.50 ± 2.39", ""]
     rewards = np.array([100.0 * m + 10 * e for m in range(MAPS) for e in range(EPISODES)])
@@ -128,7 +131,7 @@ def test_the_four_formats_hold_every_cell(tmp_path: Path) -> None:
     for suffix, cell in (("md", "| 1.00 ± 0.82 |"), ("csv", ",1.00 ± 0.82,"), ("html", "<td>1.00 ± 0.82</td>")):
         assert cell in (tmp_path / f"table.{suffix}").read_text()
     tex = (tmp_path / "table.tex").read_text()
-    assert r"RC-DSAC (resample) & pow & $-$2 & 1.00 $\pm$ 0.82 & 0.50 $\pm$ 0.84" in tex
+    assert r"RC-DSAC (resample) & pow & $-$2 & 1.00 $\pm$ 0.82 & [1.00, 1.00] & 0.50 $\pm$ 0.84" in tex
     assert tex.count(r"\\") == 3
     assert pd.read_csv(tmp_path / "table.csv").shape == shown.shape
 
@@ -268,9 +271,9 @@ def test_controllers_are_compared_with_the_best_fixed_beta(tmp_path: Path) -> No
     assert found.loc[("bandit", "collisions"), "p_value"] == 1.0
     assert "RC-DSAC (resample) pow β by clearance" in findings.labels(episodes)
     # The paper's table is of fixed betas.
-    assert table.comparison(episodes)[("", "β")].tolist() == ["-2", "-1", ""]
-    write_report(episodes, [run], tmp_path / "out")
-    assert "Does it pay to turn beta?" in (tmp_path / "out" / "report.html").read_text()
+    assert table.comparison(episodes)[("", "β or weight")].tolist() == ["-2", "-1", ""]
+    write_report(Results(episodes, [run]), tmp_path / "out")
+    assert "Does it pay to turn β?" in (tmp_path / "out" / "report.html").read_text()
     assert len(pd.read_csv(tmp_path / "out" / "adaptive.csv")) == 4
 
 
@@ -331,7 +334,8 @@ def test_the_bars_add_up_to_the_collisions_of_an_episode(tmp_path: Path) -> None
     assert [bar.get_width() * MAPS * EPISODES for bar in bars] == pytest.approx([1, 1, 1])
     assert [bool(bar.get_hatch()) for bar in bars] == [True, False, True]
     assert bars[-1].get_x() + bars[-1].get_width() == pytest.approx(3 / (MAPS * EPISODES))
-    assert [text.get_text() for text in figure.axes[0].texts] == ["0.17", "0.00"]
+    names = ["RC-DSAC (resample) pow β = -2", "RC-DSAC (resample) pow β = -1"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["0.17", "0.00", *names]
 
 
 def test_controllers_collide_under_their_names(tmp_path: Path) -> None:
@@ -374,7 +378,9 @@ def test_an_evaluation_in_a_few_lines(tmp_path: Path) -> None:
     episodes.to_csv(folder / "episodes.csv", index=False)
     with_collisions(folder, [(-2.0, "mover", 0, 0.2)] * 3 + [(-1.5, "outer_wall", 1, 0.2)])
     heading, columns, *rows, hit = summarised(folder).splitlines()
-    assert heading == "rcdsac_pow, evaluation maps 6 × 3 episodes of 1000 steps, mean ± standard deviation:"
+    assert (
+        heading == "rcdsac_pow, evaluation maps 6 × 3 episodes of 1000 steps; mean ± standard deviation of an episode:"
+    )
     assert " ".join(columns.split()) == "collisions reward goals speed, m/s in contact without collision"
     # Rewards: 100 map + 10 episode - 5 more; of 0 to 5 and of 0 to 2: 250 + 10, deviation sqrt(100² 35/12 + 10² 2/3).
     averse = "beta=-2 1.00 ± 0.82 260 ± 171 2.00 ± 0.00 0.40 ± 0.00 2.0% ± 1.4% 33%"
@@ -408,12 +414,15 @@ class Images(HTMLParser):
 
     def __init__(self) -> None:
         super().__init__()
-        self.sources: list[str] = []
-        self.tables = 0
+        self.links: list[str] = []
+        self.anchors: list[str] = []
+        self.tables = self.figures = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tables += tag == "table"
-        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        self.figures += tag == "svg"
+        self.anchors += [value or "" for name, value in attrs if name == "id"]
+        self.links += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
 
 
 def run_folder(path: Path) -> Path:
@@ -433,10 +442,13 @@ def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
     with_collisions(run / "evaluation" / "best", [(-2.0, "mover", 0, 0.2)])
     folders = [run, evaluate(tmp_path / "sac", "sac", {NONE: 3})]
     out = tmp_path / "out"
-    write_report(read_episodes(folders), folders, out)
+    write_report(Results(read_episodes(folders), folders), out)
     assert {path.name for path in out.iterdir()} == {
         *(f"table.{suffix}" for suffix in ("md", "csv", "tex", "html")),
         *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "averages", "collision_summary")),
+        "claims.csv",
+        "claims.md",
+        "claims_evidence.csv",
         *(
             f"{name}.png"
             for name in ("beta_response_pow", "differences_collisions_narrow", "differences_reward_narrow")
@@ -445,11 +457,52 @@ def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
         "collision_causes.png",
         "report.html",
     }
+    text = (out / "report.html").read_text()
     page = Images()
-    page.feed((out / "report.html").read_text())
-    assert len(page.sources) == 5
-    assert all(source.startswith("data:image/png;base64,") for source in page.sources)
-    assert page.tables == 6
+    page.feed(text)
+    # Four panels of beta, two of differences, one of causes, two metrics of learning over two clocks.
+    assert page.figures == 4 + 2 + 1 + 4
+    assert {link.removeprefix("#") for link in page.links} <= set(page.anchors)
+    assert not re.search(r"url\((?!#)|@import|https?://", text)
+    assert "RC-DSAC and SAC on 6 evaluation maps: which of the paper&#x27;s claims hold" in text
+    verdicts, beta = text.index("Averse RC-DSAC collides less"), text.index('<h2 id="what-does">')
+    assert verdicts < text.index('<h2 id="collisions-and-reward-beside-the-paper-s">') < beta
+    assert text.index("SAC collides most: every row of RC-DSAC and DSAC collides less: <b>runs missing</b>") < beta
+    # Each colour has one by night.
+    by_day, by_night = (
+        set(re.findall(r"--c[0-9a-f]{6}(?=:)", part)) for part in text.split("prefers-color-scheme")[:2]
+    )
+    assert by_day == by_night == {f"--c{name}" for name in re.findall(r"var\(--c([0-9a-f]{6})\)", text)}
+
+
+def test_the_office_course_stands_beside_the_paper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statistics, "DRAWS", 2000)
+    rows = [
+        {"run": f"runs/{agent}", "agent": agent, "beta": beta, "direction": direction, "repetition": repetition}
+        | {"finished": True, "time_s": 100.0 + repetition, "collisions": collisions + repetition}
+        for agent, beta, collisions in (("rcdsac_pow", -2.0, 0), ("sac", NONE, 9))
+        for direction in ("forward", "reverse")
+        for repetition in range(3)
+    ]
+    course = tmp_path / "course"
+    course.mkdir()
+    pd.DataFrame(rows).to_csv(course / "runs.csv", index=False)
+    (course / "course.json").write_text("{}")
+    run = evaluate(tmp_path / "sac", "sac", {NONE: 3})
+    report = command.make_report(OmegaConf.create({"runs": [str(run), str(course)], "out": str(tmp_path / "out")}))
+    report.run()
+    shown = pd.read_csv(tmp_path / "out" / "course.csv", dtype=str, keep_default_na=False).set_index("agent")
+    assert shown.loc["RC-DSAC", ["forward collisions", "forward collisions, paper"]].tolist() == ["1.0 ± 0.8", "0"]
+    # Student's t of 5 degrees of freedom over six runs of 9, 10 and 11 collisions: 10 ± 2.57 x 0.37.
+    value, low, high = map(float, re.findall(r"[\d.]+", shown.loc["SAC", "collisions a run, 95 %"]))
+    assert (value, low, high) == pytest.approx((10.0, 9.06, 10.94), abs=0.11)
+    claims = pd.read_csv(tmp_path / "out" / "claims.csv").set_index("claim")
+    found = claims.loc["SAC collides more than RC-DSAC and DSAC, row by row"]
+    assert found["verdict"] == "runs missing"
+    assert found["numbers"].startswith("1 comparison: 1 as claimed. Weakest: RC-DSAC pow β = -2: 1.00 (paper 0.00)")
+    assert "The office course beside the paper" in (tmp_path / "out" / "report.html").read_text()
+    with pytest.raises(UserInputError, match=r"holds drives over the office course, whose table is table\.md"):
+        command.make_report(OmegaConf.create({"runs": [str(course)], "out": str(tmp_path / "out")}))
 
 
 def test_the_command_refuses_before_it_writes(

@@ -35,12 +35,12 @@ def test_missing_values_do_not_count() -> None:
 
 # ------------------------------------------------------------------------------------------------ intervals
 def test_episodes_of_one_map_are_no_independent_observations() -> None:
-    """Ten equal episodes a map: as wide as the standard error over 20 maps, not over 200 episodes."""
+    """Ten equal episodes a map: as wide as Student's interval over 20 maps, not over 200 episodes."""
     maps = np.random.default_rng(1).normal(5.0, 2.0, 20)
     interval = statistics.bootstrap(np.repeat(maps, 10).reshape(1, 20, 10))
     assert interval.value == pytest.approx(maps.mean())
-    expected = 2 * 1.96 * maps.std() / 20**0.5
-    assert interval.high - interval.low == pytest.approx(expected, rel=0.1)
+    expected = 2 * 2.093 * maps.std(ddof=1) / 20**0.5  # t of 19 degrees of freedom, from any table
+    assert interval.high - interval.low == pytest.approx(expected, rel=0.05)
 
 
 def test_means_of_all_draws_at_once_are_those_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +83,7 @@ def test_seeds_alone_give_students_interval() -> None:
 def test_what_two_settings_of_the_same_agents_share_cancels_seed_by_seed() -> None:
     rng = np.random.default_rng(4)
     second = crossed(rng, 3, rng.normal(0.0, 1.0, 12), seed_spread=50.0)
-    found = statistics.compare(second + 1.0, second)
+    found = statistics.compare(second + 1.0, second, same_agents=True)
     assert vars(found.difference) == pytest.approx({"value": 1.0, "low": 1.0, "high": 1.0})
     assert found.p_value < 0.01
 
@@ -199,3 +199,55 @@ def test_a_map_without_a_value_says_nothing_about_the_trend() -> None:
 def test_what_was_never_measured_has_no_interval() -> None:
     interval = statistics.bootstrap(np.full((1, 3, 2), np.nan))
     assert np.isnan([interval.value, interval.low, interval.high]).all()
+
+
+# ------------------------------------------------------------------------------------------------ sums of means
+def test_a_sum_of_means_by_hand() -> None:
+    first, second = layout([1.0, 3.0], [2.0, 2.0]), layout([0.0, 0.0], [1.0, 1.0])
+    found = statistics.contrast([statistics.Term(2.0, first, "a"), statistics.Term(-1.0, second, "b")])
+    assert vars(found) == pytest.approx({"value": 3.5, "low": found.low, "high": found.high})
+    # By map 4 and 3, paired: two maps, t 12.71 and deviation 0.71 give 3.5 ± 6.4.
+    assert found.high - found.low == pytest.approx(2 * 12.71 * 0.5**0.5 / 2**0.5, rel=0.1)
+
+
+def test_a_map_without_a_value_is_left_out_of_a_sum() -> None:
+    values = layout([1.0], [np.nan], [1.0])
+    assert statistics.contrast([statistics.Term(1.0, values, "a")]) == statistics.Interval(1.0, 1.0, 1.0)
+    nothing = statistics.contrast([statistics.Term(1.0, np.full((1, 3, 1), np.nan), "a")])
+    assert np.isnan([nothing.value, nothing.low, nothing.high]).all()
+
+
+def test_independent_trainings_know_more_of_seeds_than_one() -> None:
+    """Each has seeds at 0 and 2: one gives t of 1 degree of freedom, ten give t of 10 and a tenth of the variance."""
+    values = np.tile(np.array([0.0, 2.0])[:, None, None], (1, 8, 1))
+    one = statistics.contrast([statistics.Term(1.0, values, "a")])
+    ten = statistics.contrast([statistics.Term(0.1, values, str(number)) for number in range(10)])
+    assert one.high - one.value == pytest.approx(12.71, rel=0.02)
+    assert ten.high - ten.value == pytest.approx(2.228 / 10**0.5, rel=0.02)
+    same = statistics.contrast([statistics.Term(0.1, values, "a") for _ in range(10)])
+    assert vars(same) == pytest.approx(vars(one))
+
+
+@pytest.mark.parametrize("seeds", [1, 2, 3])
+@pytest.mark.parametrize(("of_maps", "of_seeds"), [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)], ids=["maps", "seeds", "both"])
+def test_intervals_of_sums_hold_the_truth_as_often_as_they_say(
+    monkeypatch: pytest.MonkeyPatch, of_maps: float, of_seeds: float, seeds: int
+) -> None:
+    """Two settings of one agent against two other agents, as the paper averages; 200 draws of 20 maps and seeds."""
+    monkeypatch.setattr(statistics, "DRAWS", 200)
+    monkeypatch.setattr(statistics, "PERMUTATIONS", 2)
+    if seeds == 1:
+        of_seeds = 0.0  # one seed cannot tell
+    rng = np.random.default_rng(9)
+    held = 0
+    for _ in range(200):
+        shared, own = rng.normal(size=20), {name: of_seeds * rng.normal(size=(seeds, 1, 1)) for name in "abc"}
+        terms = [
+            statistics.Term(
+                weight, crossed(rng, seeds, of_maps * (shared + rng.normal(size=20)), seed_spread=0.0) + own[name], name
+            )
+            for weight, name in ((0.5, "a"), (0.5, "a"), (-0.5, "b"), (-0.5, "c"))
+        ]
+        interval = statistics.contrast(terms)
+        held += interval.low <= 1e-9 and interval.high >= -1e-9
+    assert held >= 0.9 * 200

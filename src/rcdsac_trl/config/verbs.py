@@ -68,7 +68,7 @@ VERBS = {
         },
     ),
     "report": Verb(
-        does="compare evaluations: the paper's table, statistics and figures",
+        does="compare evaluations: the paper's tables and claims, statistics and figures",
         examples={
             "runs=[runs/<a>,runs/<b>]": "two runs, with all that was evaluated of them",
             "runs=[runs/<a>,evaluation/<baseline>] out=mine": "a run against a baseline, into the folder `mine`",

@@ -1,4 +1,4 @@
-"""The paper's table, statistics and figures of evaluations: ``python -m rcdsac_trl.report runs=[<folder>,...]``."""
+"""The paper's tables, its claims, statistics and figures of evaluations: ``rcdsac-trl report runs=[<folder>,...]``."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,30 +6,34 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from rcdsac_trl.cli import Command
-from rcdsac_trl.report.read import Episodes, read_episodes
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.read_course import is_course, read_courses
+from rcdsac_trl.report.results import Results
 from rcdsac_trl.system.progress import Work
 from rcdsac_trl.system.resources import check_out
 
 
 @dataclass(frozen=True)
 class Report:
-    """A report that is about to be written: on which episodes, of which folders, where."""
+    """A report that is about to be written: of what, and where."""
 
-    episodes: Episodes
-    folders: list[Path]
+    results: Results
     out: Path
 
     def run(self) -> None:
-        """Write the report and print the table."""
+        """Write the report, print the table and the verdicts."""
         from rcdsac_trl.report import table
+        from rcdsac_trl.report.verdict_words import verdict_lines
         from rcdsac_trl.report.write import write_report
 
-        conditions, episodes = len(self.episodes.conditions), len(self.episodes.table)
-        doing = f"statistics and figures of {conditions} conditions, {episodes} episodes, for {self.out}"
-        with Work(doing, 1, "report"):
-            write_report(self.episodes, self.folders, self.out)
-        print(table.flattened(table.comparison(self.episodes)).to_string(index=False))
-        print(f"written to {self.out}")
+        episodes = self.results.episodes
+        counted = f"{len(episodes.conditions)} conditions, {len(episodes.table)} episodes"
+        with Work(f"statistics and figures of {counted}, for {self.out}", 1, "report"):
+            write_report(self.results, self.out)
+        print(table.flattened(self.results.paper).to_string(index=False))
+        print("\n".join(verdict_lines(self.results.claims)))
+        print(f"written to {self.out}: open {self.out / 'report.html'}")
 
 
 def make_report(cfg: DictConfig) -> Report:
@@ -39,7 +43,16 @@ def make_report(cfg: DictConfig) -> Report:
     folders = [Path(str(run)) for run in named]
     out = Path(str(cfg.out))
     check_out(out)
-    return Report(read_episodes(folders), folders, out)
+    courses = [folder for folder in folders if is_course(folder)]
+    evaluated = [folder for folder in folders if folder not in courses]
+    if courses and not evaluated:
+        raise UserInputError(
+            f"{courses[0]} holds drives over the office course, whose table is table.md in it: name evaluations, too"
+        )
+    return Report(
+        Results(read_episodes(evaluated), evaluated, read_courses(courses) if courses else None),
+        out,
+    )
 
 
 main = Command("report", make_report)

@@ -5,6 +5,7 @@ Park (2021), under the names of our rows: one run an agent, setting and directio
 """
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 
 from rcdsac_trl.colors import LIGHT
+from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, bootstrap
 from rcdsac_trl.report.style import INK
 from rcdsac_trl.report.table import markdown
 
@@ -44,7 +46,8 @@ def course_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the paper's second table: our numbers beside the paper's, as text, one row an agent and setting.
 
     Collisions and required time are mean ± standard deviation (ddof 0) over the repetitions. A run that did not finish
-    counts with its collisions until the time limit, and has no required time; `finished` says how many did.
+    counts with its collisions until the time limit, and has no required time; `finished` says how many did. The last
+    column is the mean over the runs of both directions with its interval, in which a run is the unit.
 
     Args:
         runs: ``runs.csv``.
@@ -56,7 +59,7 @@ def course_table(runs: pd.DataFrame) -> pd.DataFrame:
     for (run, agent, setting), group in runs.groupby(KEY, dropna=False, sort=False):
         beta = float(str(setting))
         row = {"run": Path(str(run)).name}
-        row["agent"], row["ψ"] = names.get(str(agent), (str(agent), ""))
+        row["agent"], row["risk measure"] = names.get(str(agent), (str(agent), ""))
         row["β"] = "" if pd.isna(beta) else f"{beta:g}"
         for direction in DIRECTIONS:
             part = group[group["direction"] == direction]
@@ -66,6 +69,8 @@ def course_table(runs: pd.DataFrame) -> pd.DataFrame:
             row[f"{direction} collisions, paper"] = "".join(f"{value:g}" for value in there["collisions"])
             row[f"{direction} time, s"] = _spread(part.loc[part["finished"], "time_s"], 0)
             row[f"{direction} time, s, paper"] = "".join(f"{value:g}" for value in there["time_s"])
+        interval = bootstrap(group["collisions"].to_numpy(float)[None, :, None]).within(0.0, math.inf)
+        row[f"collisions a run, {CONFIDENCE_TEXT}"] = f"{interval.value:.1f} [{interval.low:.1f}, {interval.high:.1f}]"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -106,7 +111,7 @@ def write_course(folder: Path) -> str:
     (folder / "table.md").write_text(markdown(table), encoding="utf-8")
     office = json.loads((folder / "office.json").read_text(encoding="utf-8"))
     course_figure(runs, traces, office).savefig(folder / "course.png", dpi=110)
-    return str(table.set_index(["run", "agent", "ψ", "β"]).T.to_string())
+    return str(table.set_index(["run", "agent", "risk measure", "β"]).T.to_string())
 
 
 def _spread(values: pd.Series, decimals: int) -> str:

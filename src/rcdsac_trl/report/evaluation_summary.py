@@ -40,7 +40,7 @@ def _table(evaluation: Evaluation) -> list[str]:
     driven = f"{told['agent']}, {told['split']} maps {told['num_maps']} × {told['num_episodes']} episodes"
     heading = ["", *(heading for *_, heading in _COLUMNS), "without collision"]
     return [
-        f"{driven} of {told['task']['episode_steps']} steps, mean ± standard deviation:",
+        f"{driven} of {told['task']['episode_steps']} steps; mean ± standard deviation of an episode:",
         *_aligned([heading, *rows]),
     ]
 

@@ -1,6 +1,8 @@
 """The figures of a report."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -13,9 +15,10 @@ from rcdsac_trl.colors import LIGHT, mixed
 from rcdsac_trl.report import statistics
 from rcdsac_trl.report.collision_report import THINGS
 from rcdsac_trl.report.findings import TAILS, bounded, labels
-from rcdsac_trl.report.read import Episodes
-from rcdsac_trl.report.statistics import Statistic
-from rcdsac_trl.report.style import FAINT, INK, MARKERS, series, style
+from rcdsac_trl.report.read import METRIC_NAMES, Episodes
+from rcdsac_trl.report.statistics import Interval, Statistic
+from rcdsac_trl.report.style import FAINT, INK, MARKERS, PAPER, series, style
+from rcdsac_trl.report.table import condition_label
 
 # What follows beta, in four panels.
 _RESPONSES: dict[str, tuple[str, Statistic]] = {
@@ -33,10 +36,13 @@ _THING_COLORS = {
     "mover": LIGHT.mover,
 }
 _OUTSIDE = "////"  # hatching
+PANEL = (4.6, 3.3)
+"""Size of a panel in inches: its texts can be read on a telephone, and two of them stand side by side on a desk."""
+_ROW_INCHES = 0.5
 
 
 def beta_response(episodes: Episodes, measure: str) -> Figure | None:
-    """Draw what beta does: collisions, speed, goals and realised tail return, with 95 % intervals.
+    """Draw what beta does in four panels: collisions, speed, goals and realised tail return, with 95 % intervals.
 
     What controllers that turn beta reach stands at the beta they used on the mean.
 
@@ -47,10 +53,7 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
     Returns:
         None where no agent was driven at two betas of the measure.
     """
-    told = episodes.conditions.dropna(subset="beta")
-    told = told[told["measure"] == measure]
-    groups = [(key, rows) for key, rows in told.groupby(["agent", "sensor"], sort=False) if len(rows) > 1]
-    if not groups:
+    if not (groups := _driven_at_several(episodes, measure)):
         return None
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     figure.suptitle(
@@ -60,27 +63,87 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
         fontsize=13,
         color=INK,
     )
-    panels = figure.subplots(2, 2).flat
-    for axes, (heading, (metric, statistic)) in zip(panels, _RESPONSES.items(), strict=True):
-        for number, ((key, rows), color) in enumerate(zip(groups, series(len(groups)), strict=True)):
-            ordered = rows.sort_values("beta")
-            values = [episodes.of(condition, metric) for _, condition in ordered.iterrows()]
-            marker = MARKERS[number % len(MARKERS)]
-            name = ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
-            _draw_intervals(axes, ordered["beta"], [bounded(v, metric, statistic) for v in values], color, marker, name)
-            _draw_turned(axes, episodes, rows.iloc[0], metric, statistic, color)
-            if metric == "reward":
-                axes.plot(
-                    ordered["beta"], [statistics.mean(v) for v in values], color=color, linestyle="--", linewidth=1.2
-                )
-        style(axes, heading, "β")
-        axes.set_xticks(sorted(told["beta"].unique()))
-        if metric != "reward":
-            axes.set_ylim(bottom=0)
+    for axes, heading in zip(figure.subplots(2, 2).flat, _RESPONSES, strict=True):
+        _draw_response(axes, episodes, groups, heading)
     if len(groups) > 1:
         handles, names = axes.get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
     return figure
+
+
+@dataclass(frozen=True)
+class Panels:
+    """Panels as figures of their own, for pages of any width.
+
+    Attributes:
+        figures: a panel each.
+        legend: names their lines; None where there is one line.
+    """
+
+    figures: list[Figure]
+    legend: Figure | None
+
+
+def beta_panels(episodes: Episodes, measure: str) -> Panels | None:
+    """Draw the panels of :func:`beta_response`; None where it has none.
+
+    Args:
+        episodes: of all agents.
+        measure: its agents are drawn.
+    """
+    if not (groups := _driven_at_several(episodes, measure)):
+        return None
+    figures = []
+    for heading in _RESPONSES:
+        figure = Figure(figsize=PANEL, layout="constrained")
+        _draw_response(figure.subplots(), episodes, groups, heading)
+        figures.append(figure)
+    return Panels(figures, _legend(figures[0].axes[0]))
+
+
+def _legend(axes: Axes) -> Figure | None:
+    """Draw the legend of a panel alone."""
+    handles, names = axes.get_legend_handles_labels()
+    if len(names) < 2:
+        return None
+    figure = Figure(figsize=(PANEL[0], 0.1 + 0.2 * len(names)))
+    figure.legend(handles, names, loc="center left", frameon=False, fontsize=9, labelcolor=INK)
+    return figure
+
+
+_Groups = list[tuple[str, pd.DataFrame]]
+
+
+def _driven_at_several(episodes: Episodes, measure: str) -> _Groups:
+    """Return agents by name, with their conditions in the order of beta, where there are several of the measure."""
+    told = episodes.conditions.dropna(subset="beta")
+    groups = told[told["measure"] == measure].groupby(["agent", "sensor"], sort=False)
+    sensors = told["sensor"].nunique()
+    return [
+        (condition_label(str(agent), str(sensor), math.nan, math.nan, None, sensors), rows.sort_values("beta"))
+        for (agent, sensor), rows in groups
+        if len(rows) > 1
+    ]
+
+
+def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str) -> None:
+    metric, statistic = _RESPONSES[heading]
+    for number, ((name, rows), color) in enumerate(zip(groups, series(len(groups)), strict=True)):
+        values = [episodes.of(condition, metric) for _, condition in rows.iterrows()]
+        marker = MARKERS[number % len(MARKERS)]
+        if any(len(v) > 1 for v in values):
+            _shade(axes, rows["beta"], [bounded(v, metric, statistic) for v in values], color, alpha=0.08)
+        alone = [bounded(statistics.of_these_agents(v), metric, statistic) for v in values]
+        _shade(axes, rows["beta"], alone, color, alpha=0.22)
+        middle = [interval.value for interval in alone]
+        axes.plot(rows["beta"], middle, color=color, marker=marker, markersize=6, linewidth=1.9, label=name)
+        _draw_turned(axes, episodes, rows.iloc[0], metric, statistic, color)
+        if metric == "reward":
+            axes.plot(rows["beta"], [statistics.mean(v) for v in values], color=color, linestyle="--", linewidth=1.2)
+    style(axes, heading, "β")
+    axes.set_xticks(sorted({beta for _, rows in groups for beta in rows["beta"]}))
+    if metric != "reward":
+        axes.set_ylim(0.0, 1.05 * axes.get_ylim()[1])
 
 
 def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figure:
@@ -94,21 +157,33 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
     conditions, names = episodes.conditions, labels(episodes)
     base = conditions.iloc[reference]
     others = [i for i in range(len(conditions)) if i != reference and conditions.iloc[i]["sensor"] == base["sensor"]]
-    figure = Figure(figsize=(11.0, 1.6 + 0.42 * len(others)), layout="constrained")
+    figure = Figure(figsize=(PANEL[0], 1.0 + _ROW_INCHES * len(others)), layout="constrained")
     axes = figure.subplots()
     rng = np.random.default_rng(0)
     for row, i in enumerate(others):
         first, second = episodes.of(conditions.iloc[i], metric), episodes.of(base, metric)
         maps = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
-        found = statistics.compare(first, second).difference
-        axes.scatter(maps, row + rng.uniform(-0.16, 0.16, len(maps)), s=9, color=FAINT, alpha=0.6, linewidths=0)
-        axes.plot([found.low, found.high], [row, row], color=INK, linewidth=2.2, solid_capstyle="butt")
+        same = conditions.iloc[i]["agent"] == base["agent"]
+        found = statistics.compare(first, second, same_agents=same).difference
+        alone = statistics.compare(*map(statistics.of_these_agents, (first, second))).difference
+        axes.scatter(maps, row + rng.uniform(-0.1, 0.1, len(maps)), s=9, color=FAINT, alpha=0.6, linewidths=0)
+        axes.plot([found.low, found.high], [row, row], color=INK, linewidth=1.0, solid_capstyle="butt")
+        axes.plot([alone.low, alone.high], [row, row], color=INK, linewidth=3.0, solid_capstyle="butt")
         axes.plot(found.value, row, "o", color=INK, markersize=6)
-    style(axes, f"{metric}: difference from {names[reference]}, map by map (mean and 95 % interval)")
+    style(axes, f"{METRIC_NAMES[metric]}: difference from {names[reference]}\nmap by map (mean and 95 % interval)")
     axes.axvline(0, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
-    axes.set_yticks(range(len(others)), [names[i] for i in others])
-    axes.invert_yaxis()
+    _name_rows(axes, [names[i] for i in others])
     return figure
+
+
+def _name_rows(axes: Axes, names: Sequence[str]) -> None:
+    """Write a name above each row: beside the axes, long names would leave a narrow figure no room."""
+    for row, name in enumerate(names):
+        axes.text(0.0, row - 0.33, name, transform=axes.get_yaxis_transform(), fontsize=9, color=INK, va="center")
+    axes.set_yticks([])
+    axes.spines["left"].set_visible(False)
+    axes.grid(visible=False, axis="y")
+    axes.set_ylim(len(names) - 0.6, -0.6)
 
 
 def collision_causes(summary: pd.DataFrame) -> Figure:
@@ -118,7 +193,7 @@ def collision_causes(summary: pd.DataFrame) -> Figure:
         summary: from :func:`rcdsac_trl.report.collision_report.of_episodes`.
     """
     names = summary["condition"].drop_duplicates().tolist()
-    figure = Figure(figsize=(11.0, 1.9 + 0.42 * len(names)), layout="constrained")
+    figure = Figure(figsize=(PANEL[0], 2.2 + _ROW_INCHES * len(names)), layout="constrained")
     axes = figure.subplots()
     for row, name in enumerate(names):
         parts = summary[summary["condition"] == name].set_index("thing")
@@ -126,20 +201,16 @@ def collision_causes(summary: pd.DataFrame) -> Figure:
         for thing in (thing for thing in THINGS if thing in parts.index):
             outside = parts.at[thing, "per_episode"] * parts.at[thing, "outside_share"]
             for width, hatch in ((parts.at[thing, "per_episode"] - outside, ""), (outside, _OUTSIDE)):
-                axes.barh(
-                    row, width, 0.7, left, color=_THING_COLORS[thing], hatch=hatch, edgecolor=LIGHT.card, linewidth=0
-                )
+                axes.barh(row, width, 0.34, left, color=_THING_COLORS[thing], hatch=hatch, edgecolor=PAPER, linewidth=0)
                 left += width
         axes.annotate(f"{left:.2f}", (left, row), xytext=(5, 0), textcoords="offset points", va="center", color=INK)
     style(axes, "What was hit", "collisions an episode")
-    axes.set_yticks(range(len(names)), names)
-    axes.grid(visible=False, axis="y")
     axes.set_xlim(left=0)
-    axes.margins(x=0.08)
-    axes.invert_yaxis()
+    axes.margins(x=0.14)
+    _name_rows(axes, names)
     handles = [Patch(color=_THING_COLORS[thing], label=name) for thing, name in THINGS.items()]
-    handles.append(Patch(facecolor=FAINT, hatch=_OUTSIDE, edgecolor=LIGHT.card, label="outside the sensor's sectors"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
+    handles.append(Patch(facecolor=FAINT, hatch=_OUTSIDE, edgecolor=PAPER, label="outside the sensor's sectors"))
+    figure.legend(handles=handles, loc="outside lower left", ncols=1, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
 
@@ -151,41 +222,57 @@ def learning_curves(runs: Mapping[str, pd.DataFrame]) -> Figure:
     """
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     figure.suptitle("Validation during training", x=0.01, ha="left", fontsize=13, color=INK)
-    clocks = (("updates", "updates", 1.0), ("elapsed_s", "minutes", 1 / 60))
-    shown = [clock for clock in clocks if any(clock[0] in rows for rows in runs.values())]
-    panels = figure.subplots(2, len(shown), squeeze=False)
-    for column, (clock, label, scale) in enumerate(shown):
+    clocks = _clocks(runs)
+    panels = figure.subplots(2, len(clocks), squeeze=False)
+    for column, clock in enumerate(clocks):
         for row, metric in enumerate(_LEARNT):
-            axes = panels[row][column]
-            for number, ((name, rows), color) in enumerate(zip(runs.items(), series(len(runs)), strict=True)):
-                if clock not in rows:
-                    continue
-                means = rows.groupby(clock)[metric].mean()
-                marker = MARKERS[number % len(MARKERS)]
-                axes.plot(
-                    means.index * scale, means, color=color, marker=marker, markersize=4, linewidth=1.9, label=name
-                )
-            style(axes, f"{metric} an episode", label)
-            axes.set_xlim(left=0)
-            axes.xaxis.set_major_locator(MaxNLocator(5))
-            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-            if metric == "collisions":
-                axes.set_ylim(bottom=0)
+            _draw_learning(panels[row][column], runs, metric, clock)
     panels[0][0].legend(frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
 
-def _draw_intervals(
-    axes: Axes,
-    x: pd.Series,
-    intervals: list[statistics.Interval],
-    color: str,
-    marker: str,
-    label: str,
-) -> None:
-    middle = [interval.value for interval in intervals]
-    axes.fill_between(x, [i.low for i in intervals], [i.high for i in intervals], color=color, alpha=0.15, linewidth=0)
-    axes.plot(x, middle, color=color, marker=marker, markersize=6, linewidth=1.9, label=label)
+def learning_panels(runs: Mapping[str, pd.DataFrame]) -> Panels:
+    """Draw the panels of :func:`learning_curves`.
+
+    Args:
+        runs: as there.
+    """
+    figures = []
+    for metric in _LEARNT:
+        for clock in _clocks(runs):
+            figure = Figure(figsize=PANEL, layout="constrained")
+            _draw_learning(figure.subplots(), runs, metric, clock)
+            figures.append(figure)
+    return Panels(figures, _legend(figures[0].axes[0]))
+
+
+_Clock = tuple[str, str, float]
+
+
+def _clocks(runs: Mapping[str, pd.DataFrame]) -> list[_Clock]:
+    """Return what time is told by: column, name, and what its values are multiplied by."""
+    clocks: tuple[_Clock, ...] = (("updates", "updates", 1.0), ("elapsed_s", "minutes", 1 / 60))
+    return [clock for clock in clocks if any(clock[0] in rows for rows in runs.values())]
+
+
+def _draw_learning(axes: Axes, runs: Mapping[str, pd.DataFrame], metric: str, clock: _Clock) -> None:
+    column, label, scale = clock
+    for number, ((name, rows), color) in enumerate(zip(runs.items(), series(len(runs)), strict=True)):
+        if column in rows:
+            means = rows.groupby(column)[metric].mean()
+            marker = MARKERS[number % len(MARKERS)]
+            axes.plot(means.index * scale, means, color=color, marker=marker, markersize=4, linewidth=1.9, label=name)
+    style(axes, METRIC_NAMES[metric], label)
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+    if metric == "collisions":
+        axes.set_ylim(bottom=0)
+
+
+def _shade(axes: Axes, x: pd.Series, intervals: Sequence[Interval], color: str, alpha: float) -> None:
+    low, high = [interval.low for interval in intervals], [interval.high for interval in intervals]
+    axes.fill_between(x, low, high, color=color, alpha=alpha, linewidth=0)
 
 
 def _draw_turned(
@@ -203,9 +290,7 @@ def _draw_turned(
         beta = statistics.mean(episodes.of(condition, "mean_beta"))
         found = bounded(episodes.of(condition, metric), metric, statistic)
         axes.plot([beta, beta], [found.low, found.high], color=color, linewidth=1.2)
-        axes.plot(
-            beta, found.value, marker="*", markersize=11, color=color, markeredgecolor=LIGHT.card, linestyle="none"
-        )
+        axes.plot(beta, found.value, marker="*", markersize=11, color=color, markeredgecolor=PAPER, linestyle="none")
         name = condition["beta_controller"].replace("_", " ")
         at = (beta, found.value)
         axes.annotate(name, at, textcoords="offset points", xytext=(6, 4), fontsize=8, color=INK)

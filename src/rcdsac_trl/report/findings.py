@@ -18,7 +18,8 @@ SUMMARISED: dict[str, tuple[str, Statistic]] = {
 }
 """Statistics beside the means of all metrics: of which metric, and which."""
 TRENDS = ("collisions", "mean_speed_m_per_s", "goals", "reward")
-_COMPARED = ("collisions", "reward")
+COMPARED = ("collisions", "reward")
+"""Metrics of which conditions are compared with each other."""
 # Collisions are better fewer.
 _BETTER_DOWN = {"collisions"}
 
@@ -61,8 +62,9 @@ def comparisons(episodes: Episodes) -> pd.DataFrame:
     for ((_, first), first_label), ((_, second), second_label) in itertools.combinations(named, 2):
         if first["sensor"] != second["sensor"]:
             continue
-        for metric in _COMPARED:
-            found = statistics.compare(episodes.of(first, metric), episodes.of(second, metric))
+        for metric in COMPARED:
+            same = first["agent"] == second["agent"]
+            found = statistics.compare(episodes.of(first, metric), episodes.of(second, metric), same_agents=same)
             better = found.improvement
             if metric in _BETTER_DOWN:
                 better = Interval(1 - better.value, 1 - better.high, 1 - better.low)
@@ -128,13 +130,13 @@ def adaptive(episodes: Episodes) -> pd.DataFrame:
     for (agent, sensor), conditions in episodes.conditions.groupby(["agent", "sensor"], sort=False):
         turned = conditions[conditions["beta_controller"].notna()]
         fixed = [condition for _, condition in conditions.dropna(subset="beta").iterrows()]
-        for metric in _COMPARED:
+        for metric in COMPARED:
             means = [statistics.mean(episodes.of(condition, metric)) for condition in fixed]
             found = []
             for _, condition in turned.iterrows():
                 best = int(np.argmin(means) if metric in _BETTER_DOWN else np.argmax(means))
                 values = episodes.of(condition, metric)
-                compared = statistics.compare(values, episodes.of(fixed[best], metric))
+                compared = statistics.compare(values, episodes.of(fixed[best], metric), same_agents=True)
                 found.append(
                     {
                         "agent": agent,

@@ -44,7 +44,8 @@ METRIC_NAMES: dict[str, str] = {
     "smallest_clearance_m": "smallest clearance, m",
 }
 """Metrics in the order of reports, and what they are called there."""
-_SHARES = ("contact_fraction", "collision_free", "success", "collided", "timed_out", "spl")
+SHARES = ("contact_fraction", "collision_free", "success", "collided", "timed_out")
+"""Metrics that are shares of something, and written in percent."""
 
 
 def possible(metric: str) -> tuple[float, float]:
@@ -54,7 +55,7 @@ def possible(metric: str) -> tuple[float, float]:
         >>> possible("collisions")
         (0.0, inf)
     """
-    if metric in _SHARES:
+    if metric in (*SHARES, "spl"):
         return 0.0, 1.0
     return (-math.inf if metric == "reward" else 0.0), math.inf
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rcdsac_trl.colors import LIGHT
-from rcdsac_trl.report.page import Part, page
+from rcdsac_trl.report.page import Picture, Section, page
 from rcdsac_trl.report.style import FAINT, GRID, INK, style
 
 _AGENT, _RECORDED, _MEASURED = LIGHT.robot, LIGHT.mover, LIGHT.mapped
@@ -135,12 +135,14 @@ def write_replay(folder: Path) -> str:
         "goal": "The waypoints are the recorded goals, straight on.",
         "trajectory": "The waypoints are the corners of the way that was driven, by odometry: no plan is used.",
     }
-    sections: list[tuple[str, list[Part]]] = [
-        ("What it would have done", [_NOTE, ways[described["waypoints"]], figure, summary]),
-        ("Why it stood, or was limited", [causes if len(causes) else nothing]),
-        ("What was read", [pd.DataFrame(_readable(described), columns=["", "value"])]),
+    title = f"{described['recording']}: what {described['agent']} would have done"
+    drawn = Picture(figure, "Commands, expected return and nearest thing over time, and where the robot was")
+    sections = [
+        Section("What it would have done", [ways[described["waypoints"]], drawn, summary]),
+        Section("Why it stood, or was limited", [causes if len(causes) else nothing]),
+        Section("What was read", [pd.DataFrame(_readable(described), columns=["", "value"])]),
     ]
-    (folder / "replay.html").write_text(page(f"Replay of {described['recording']}", sections), encoding="utf-8")
+    (folder / "replay.html").write_text(page(title, [_NOTE], sections), encoding="utf-8")
     text = [summary.to_string(index=False, header=False), causes.to_string(index=False) if len(causes) else nothing]
     return "\n\n".join(text)
 

@@ -4,10 +4,12 @@ many independent observations.
 Values come as arrays ``[S, M, E]``: training seeds, maps, episodes on a map. Seeds and maps are crossed, not nested:
 the agents of all seeds met the same maps. So a resample draws its maps once, for all seeds. The seeds themselves are
 few, and resampling few values gives intervals that are too narrow (95 % intervals of two seeds hold the truth half of
-the time): what seeds add to an error is taken from Student's t distribution.
+the time): what seeds add to an error is taken from Student's t distribution. Where several trainings add to it, its
+degrees of freedom are those of Welch and Satterthwaite: two seeds of each of five agents know more than two of one.
 """
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,6 +21,8 @@ Array = NDArray[np.float64]
 Statistic = Callable[[Array], float]
 
 CONFIDENCE = 0.95
+CONFIDENCE_TEXT = f"{100 * CONFIDENCE:.0f} %"
+"""How it is written."""
 _BOUNDS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2
 DRAWS = 2000
 """Resamples of an interval."""
@@ -79,6 +83,29 @@ def mean(values: Array) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
+def mean_over(values: Array, axis: tuple[int, ...]) -> Array:
+    """Return the mean over some axes of what was measured, NaN where nothing was."""
+    measured = np.isfinite(values).sum(axis)
+    sums = np.nansum(values, axis)
+    return np.divide(sums, measured, out=np.full(sums.shape, np.nan), where=measured > 0)
+
+
+def of_these_agents(values: Array) -> Array:
+    """Put the episodes of all training seeds together as one agent's: intervals then speak of these agents alone.
+
+    Args:
+        values: ``[S, M, E]``.
+
+    Returns:
+        ``[1, M, S E]``.
+
+    Example:
+        >>> of_these_agents(np.array([[[1.0], [2.0]], [[3.0], [4.0]]])).tolist()
+        [[[1.0, 3.0], [2.0, 4.0]]]
+    """
+    return np.moveaxis(values, 0, 1).reshape(1, values.shape[1], -1)
+
+
 def interquartile_mean(values: Array) -> float:
     """Return the mean of the middle half (Agarwal et al., 2021): less noisy than the median, robust to disasters.
 
@@ -135,7 +162,8 @@ def bootstrap(values: Array, statistic: Statistic = mean) -> Interval:
     else:
         drawn = np.array([statistic(values[:, maps]) for maps in chosen])
     of_seeds = np.array([statistic(values[seed]) for seed in range(len(values))])
-    return _interval(statistic(values), drawn + _errors_of_seeds(DRAWS, of_seeds))
+    value = statistic(values)
+    return _interval(value, _widened(drawn, value, values.shape[1]) + _errors_of_seeds(DRAWS, of_seeds))
 
 
 def bootstrap_maps(values: Array, statistic: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
@@ -157,33 +185,81 @@ def bootstrap_maps(values: Array, statistic: Callable[[Array], Array]) -> tuple[
     return statistic(values), low, high
 
 
-def compare(first: Array, second: Array) -> Comparison:
+def compare(first: Array, second: Array, *, same_agents: bool = False) -> Comparison:
     """Compare two sets of episodes on the same maps.
 
     Intervals resample maps, for both sides and all seeds at once. The test permutes, map by map, which side is which
     (the mean of a map over seeds and episodes is one observation): exact, and without an assumption about the
     distribution. A side with several training seeds adds an :func:`error of the seeds <_errors_of_seeds>` to every
-    resample and permutation. With as many seeds on both sides, the errors are those of the differences seed by seed:
-    what two settings of the same agents have in common cancels, and where the agents are others no harm is done.
+    resample and permutation. Of two settings of the same agents the errors are those of the differences seed by seed:
+    what the settings have in common cancels.
 
     Args:
         first: ``[S, M, E]``.
-        second: ``[S', M, E]``, the same maps, starts and goals; seeds in the same order.
+        second: ``[S', M, E]``, the same maps, starts and goals.
+        same_agents: whether both sides were driven by the same agents, in one order; else they are independent.
     """
     differences = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
     maps = len(differences)
     chosen, signs = _resamples(maps, DRAWS, PERMUTATIONS)
-    of_seeds = np.nanmean(first, axis=(1, 2)), -np.nanmean(second, axis=(1, 2))
-    drawn = differences[chosen].mean(1) + _errors_of_seeds(DRAWS, *of_seeds)
+    of_seeds = _of_trainings(np.nanmean(first, axis=(1, 2)), -np.nanmean(second, axis=(1, 2)), same_agents)
+    drawn = _widened(differences[chosen].mean(1), differences.mean(), maps) + _errors_of_seeds(DRAWS, *of_seeds)
     permuted = signs @ differences + maps * _errors_of_seeds(PERMUTATIONS, *of_seeds)
     improvements = _improvements(first, second)
-    improved = improvements.mean((0, 1))[chosen].mean(1)
-    improved += _errors_of_seeds(DRAWS, improvements.mean((1, 2)), improvements.mean((0, 2)))
+    improved = _widened(improvements.mean((0, 1))[chosen].mean(1), improvements.mean(), maps)
+    by_seed = _of_trainings(improvements.mean((1, 2)), improvements.mean((0, 2)), same_agents)
+    improved += _errors_of_seeds(DRAWS, *by_seed)
     return Comparison(
         difference=_interval(differences.mean(), drawn),
         improvement=_interval(improvements.mean(), np.clip(improved, 0.0, 1.0)),
         p_value=_p_value(np.abs(permuted) >= abs(differences.sum()) - 1e-9),
     )
+
+
+@dataclass(frozen=True)
+class Term:
+    """A part of a sum of means.
+
+    Attributes:
+        weight: what the mean counts in the sum; -1 takes it off.
+        values: ``[S, M, E]``.
+        training: names the agents that drove; terms of one name were driven by the same ones, in one order of seeds.
+    """
+
+    weight: float
+    values: Array
+    training: str
+
+
+def contrast(terms: Sequence[Term], confidence: float = CONFIDENCE) -> Interval:
+    """Return a weighted sum of means over the same maps, and its interval with maps and training seeds crossed.
+
+    Every resample draws its maps once, for all terms and all seeds. What seeds add is summed seed by seed over the
+    terms of one training, and independent from one training to another. A training with a single seed adds nothing: of
+    it the interval speaks as of one agent.
+
+    Args:
+        terms: at least one, all with the same maps.
+        confidence: of the interval.
+
+    Example:
+        >>> averse, bold = np.array([[[0.0], [2.0]]]), np.array([[[1.0], [3.0]]])
+        >>> contrast([Term(1.0, averse, "a"), Term(-1.0, bold, "a")])
+        Interval(value=-1.0, low=-1.0, high=-1.0)
+    """
+    by_map = np.sum([term.weight * mean_over(term.values, (0, 2)) for term in terms], axis=0)
+    by_map = by_map[np.isfinite(by_map)]  # a map on which a term was never measured says nothing
+    if not len(by_map):
+        return Interval(float("nan"), float("nan"), float("nan"))
+    chosen, _ = _resamples(len(by_map), DRAWS, PERMUTATIONS)
+    # A setting that fewer seeds were driven at is apart from the others of its agent: whose they are is not known.
+    of_trainings: defaultdict[tuple[str, int], Array] = defaultdict(lambda: np.zeros(1))
+    for term in terms:
+        of_seeds = term.weight * mean_over(term.values, (1, 2))
+        of_trainings[term.training, len(of_seeds)] = of_trainings[term.training, len(of_seeds)] + of_seeds
+    value = by_map.mean()
+    drawn = _widened(by_map[chosen].mean(1), value, len(by_map)) + _errors_of_seeds(DRAWS, *of_trainings.values())
+    return _interval(value, drawn, confidence)
 
 
 def trend(values: Array) -> Trend:
@@ -239,30 +315,51 @@ def _resamples(maps: int, draws: int, permutations: int) -> tuple[NDArray[np.int
     return rng.integers(maps, size=(draws, maps)), rng.choice([-1.0, 1.0], size=(permutations, maps))
 
 
-def _errors_of_seeds(number: int, *of_seeds: Array) -> Array:
+def _widened(drawn: Array, value: float, maps: int) -> Array:
+    """Spread resamples of few maps as far as Student's t says: as they fall they are too near to each other.
+
+    Their deviations are those of maps drawn from a handful (the root of n / (n - 1) too small), and their distribution
+    is as good as normal (t wider than it). One map says nothing of others: its resamples stay what they are.
+    """
+    if maps < 2:
+        return drawn
+    factor = stats.t.ppf(_BOUNDS[1], maps - 1) / stats.norm.ppf(_BOUNDS[1]) * (maps / (maps - 1)) ** 0.5
+    widened: Array = value + factor * (drawn - value)
+    return widened
+
+
+def _of_trainings(first: Array, second: Array, same_agents: bool) -> tuple[Array, ...]:
+    """Put what the seeds of two sides add together where they are the same agents."""
+    # A setting that fewer seeds were driven at is apart: whose seeds they are is not known.
+    return (first + second,) if same_agents and len(first) == len(second) else (first, second)
+
+
+def _errors_of_seeds(number: int, *of_trainings: Array) -> Array:
     """Draw by how much other training seeds would have changed a result.
 
-    The error of a mean over S seeds is their standard deviation times Student's t with S - 1 degrees of freedom, over
-    the square root of S. The quantiles of t are drawn evenly, so that its far tails do not depend on luck.
+    The error of a mean over S seeds is their standard deviation over the square root of S, times Student's t with S - 1
+    degrees of freedom. Errors of independent trainings add up to one whose degrees of freedom are those of Welch and
+    Satterthwaite. The quantiles of t are drawn evenly, so that its far tails do not depend on luck.
 
     Args:
         number: how many errors.
-        of_seeds: for each side of a comparison what each of its seeds adds, ``[S]``; sides with as many seeds are added
-            up seed by seed, others are independent. NaN is a seed on which nothing was measured.
+        of_trainings: for each independent training what each of its seeds adds, ``[S]``. NaN is a seed on which nothing
+            was measured.
 
     Returns:
-        ``[number]``; zero for a side with one seed, whose spread nobody knows.
+        ``[number]``; a training with one seed, whose spread nobody knows, adds nothing.
     """
-    if len({len(side) for side in of_seeds}) == 1:
-        of_seeds = (np.sum(of_seeds, axis=0),)
-    rng = np.random.default_rng([_SEED, 1])  # independent of the maps drawn
-    errors = np.zeros(number)
-    for side in of_seeds:
-        measured = side[np.isfinite(side)]
-        if len(measured) > 1:
-            t = stats.t.ppf((np.arange(number) + 0.5) / number, len(measured) - 1)
-            errors += rng.permutation(t) * measured.std(ddof=1) / len(measured) ** 0.5
-    return errors
+    measured = [seeds[np.isfinite(seeds)] for seeds in of_trainings]
+    several = [seeds for seeds in measured if len(seeds) > 1]
+    variances = np.array([seeds.var(ddof=1) / len(seeds) for seeds in several])
+    total = variances.sum()
+    if total == 0.0:
+        return np.zeros(number)
+    freedom = total**2 / (variances**2 / [len(seeds) - 1 for seeds in several]).sum()
+    t = stats.t.ppf((np.arange(number) + 0.5) / number, freedom)
+    # Independent of the maps drawn.
+    drawn: Array = np.random.default_rng([_SEED, 1]).permutation(t) * total**0.5
+    return drawn
 
 
 def _improvements(first: Array, second: Array) -> Array:
@@ -271,10 +368,10 @@ def _improvements(first: Array, second: Array) -> Array:
     return ((pairs > 0) + 0.5 * (pairs == 0)).mean((3, 4))
 
 
-def _interval(value: float, drawn: Array) -> Interval:
+def _interval(value: float, drawn: Array, confidence: float = CONFIDENCE) -> Interval:
     if np.isnan(drawn).all():  # nobody ever measured it, such as a time to goals that none reached
         return Interval(float("nan"), float("nan"), float("nan"))
-    low, high = np.nanquantile(drawn, _BOUNDS)
+    low, high = np.nanquantile(drawn, ((1 - confidence) / 2, (1 + confidence) / 2))
     return Interval(float(value), float(low), float(high))
 
 

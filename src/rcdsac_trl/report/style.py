@@ -7,7 +7,14 @@ from matplotlib.colors import LinearSegmentedColormap
 
 from rcdsac_trl.colors import LIGHT, SERIES
 
-INK, FAINT, GRID = LIGHT.ink, LIGHT.faint, LIGHT.grid
+INK, FAINT, GRID, PAPER = LIGHT.ink, LIGHT.faint, LIGHT.grid, LIGHT.card
+VERDICTS = {
+    "holds": LIGHT.way,
+    "does not hold": LIGHT.alarm,
+    "cannot be told": LIGHT.unmapped_edge,
+    "runs missing": LIGHT.faint,
+}
+"""Colours of the words of verdicts."""
 MARKERS = "osD^vP"
 """Shapes tell lines apart where colours do not."""
 SIGNED = LinearSegmentedColormap.from_list("signed", (LIGHT.robot, LIGHT.card, LIGHT.unmapped))

@@ -7,9 +7,12 @@ rows. Mean and standard deviation over 500 episodes, 50 maps x 10.
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
-from rcdsac_trl.report.read import Episodes
+from rcdsac_trl.report.formats import interval, number
+from rcdsac_trl.report.read import Episodes, possible
+from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, bootstrap
 
 SENSORS = ("narrow", "sparse")
 TABULATED = ("collisions", "reward")
@@ -22,13 +25,37 @@ def paper_table() -> pd.DataFrame:
 
 
 def own_table(episodes: Episodes) -> pd.DataFrame:
-    """Return mean and standard deviation (ddof 0) over the episodes, in the form of :func:`paper_table`."""
-    fixed = episodes.table[episodes.table["beta_controller"].isna()]  # the paper turns no beta
-    groups = fixed.groupby([*KEY, "sensor"], dropna=False, sort=False)
-    parts: dict[str, pd.Series] = {"episodes": groups.size()}
-    for metric in TABULATED:
-        parts |= {f"{metric}_mean": groups[metric].mean(), f"{metric}_std": groups[metric].std(ddof=0)}
-    return pd.DataFrame(parts).reset_index().merge(_names(), on="agent", how="left")
+    """Return our numbers in the form of :func:`paper_table`, with `low` and `high` of each mean's interval beside it.
+
+    Standard deviations (ddof 0) are over the episodes, as the paper's; intervals are over maps, and over training seeds
+    where there are several.
+    """
+    conditions = episodes.conditions
+    rows = []
+    for _, condition in conditions[conditions["beta_controller"].isna()].iterrows():  # the paper turns no beta
+        row = {key: condition[key] for key in [*KEY, "sensor"]}
+        for metric in TABULATED:
+            values = episodes.of(condition, metric)
+            found = bootstrap(values).within(*possible(metric))
+            row |= {f"{metric}_mean": found.value, f"{metric}_std": np.nanstd(values)}
+            row |= {f"{metric}_low": found.low, f"{metric}_high": found.high}
+        rows.append(row)
+    return pd.DataFrame(rows).merge(_names(), on="agent", how="left")
+
+
+def missing_rows(episodes: Episodes) -> dict[str, list[str]]:
+    """Return the rows of the paper's table that were not driven, by sensor."""
+    own = episodes.conditions
+    driven = own[own["beta_controller"].isna()][[*KEY, "sensor"]]
+    found = paper_table().merge(driven, on=[*KEY, "sensor"], how="left", indicator=True)
+    absent = found[found["_merge"] == "left_only"]
+    return {
+        sensor: [
+            condition_label(agent, sensor, beta, weight, None)
+            for agent, beta, weight in absent.loc[absent["sensor"] == sensor, KEY].itertuples(index=False)
+        ]
+        for sensor in SENSORS
+    }
 
 
 def averages(table: pd.DataFrame) -> pd.DataFrame:
@@ -40,8 +67,7 @@ def averages(table: pd.DataFrame) -> pd.DataFrame:
     Returns:
         `name`, `sensor`, `collisions` and `reward`, for each name of which all four rows are there.
     """
-    paper = paper_table()
-    wanted = pd.MultiIndex.from_frame(paper[paper["name"] == "DSAC"][["psi", "beta"]].drop_duplicates())
+    wanted = averaged_settings()
     rows = []
     for (name, sensor), part in table.groupby(["name", "sensor"], sort=False):
         found = part.set_index(["psi", "beta"])
@@ -49,6 +75,12 @@ def averages(table: pd.DataFrame) -> pd.DataFrame:
             means = found.loc[wanted, ["collisions_mean", "reward_mean"]].mean()
             rows.append((name, sensor, means["collisions_mean"], means["reward_mean"]))
     return pd.DataFrame(rows, columns=["name", "sensor", "collisions", "reward"])
+
+
+def averaged_settings() -> pd.MultiIndex:
+    """Return measure and setting of what the paper's text averages over: where it evaluates DSAC."""
+    paper = paper_table()
+    return pd.MultiIndex.from_frame(paper[paper["name"] == "DSAC"][["psi", "beta"]].drop_duplicates())
 
 
 def condition_label(
@@ -69,7 +101,7 @@ def row_label(agent: str) -> str:
         >>> row_label("rcdsac_pow"), row_label("sac"), row_label("mine")
         ('RC-DSAC (resample) pow', 'SAC', 'mine')
     """
-    return " ".join(part for part in _called(agent) if part)
+    return " ".join(part for part in called(agent) if part)
 
 
 def _names() -> pd.DataFrame:
@@ -77,8 +109,8 @@ def _names() -> pd.DataFrame:
     return paper_table()[["agent", "name", "psi"]].drop_duplicates()
 
 
-def _called(agent: str) -> tuple[str, str]:
-    """Return the paper's name and measure of a row; its own name where the paper has none."""
+def called(agent: str) -> tuple[str, str]:
+    """Return the paper's name and risk measure of a row; its own name and no measure where the paper has none."""
     names = _names().set_index("agent").fillna("")
     return (str(names.at[agent, "name"]), str(names.at[agent, "psi"])) if agent in names.index else (agent, "")
 
@@ -97,21 +129,30 @@ def comparison(episodes: Episodes) -> pd.DataFrame:
     order = pd.concat([paper[KEY], own[KEY]]).drop_duplicates()
     order = order.merge(own[KEY].drop_duplicates(), on=KEY)  # the rows we have, in the paper's order
     out = pd.DataFrame(
-        [(*_called(agent), _setting(beta, weight)) for agent, beta, weight in order.itertuples(index=False)],
-        columns=pd.MultiIndex.from_tuples([("", "agent"), ("", "ψ"), ("", "β")]),
+        [(*called(agent), _setting(beta, weight)) for agent, beta, weight in order.itertuples(index=False)],
+        columns=pd.MultiIndex.from_tuples([("", "agent"), ("", "risk measure"), ("", "β or weight")]),
     )
     there = list(own["sensor"].unique())
     for sensor in sorted(there, key=lambda name: (*SENSORS, name).index(name)):
+        of_own, of_paper = (
+            order.merge(source[source["sensor"] == sensor], on=KEY, how="left") for source in (own, paper)
+        )
         for metric in TABULATED:
-            for label, source in (("", own), (", paper", paper)):
-                of_sensor = order.merge(source[source["sensor"] == sensor], on=KEY, how="left")
-                decimals = 2 if metric == "collisions" else 1
-                cells = [
-                    "" if pd.isna(mean) else f"{mean:.{decimals}f} ± {std:.{decimals}f}"
-                    for mean, std in zip(of_sensor[f"{metric}_mean"], of_sensor[f"{metric}_std"], strict=True)
-                ]
-                out[(sensor, f"{metric}{label}")] = cells
+            out[(sensor, metric)] = _spreads(of_own, metric)
+            out[(sensor, f"{metric}, {CONFIDENCE_TEXT}")] = _intervals(of_own, metric)
+            out[(sensor, f"{metric}, paper")] = _spreads(of_paper, metric)
     return out
+
+
+def _spreads(rows: pd.DataFrame, metric: str) -> list[str]:
+    """Write mean ± standard deviation with the paper's decimals; nothing where there is none."""
+    pairs = zip(rows[f"{metric}_mean"], rows[f"{metric}_std"], strict=True)
+    return ["" if pd.isna(mean) else f"{number(mean, metric)} ± {number(std, metric)}" for mean, std in pairs]
+
+
+def _intervals(rows: pd.DataFrame, metric: str) -> list[str]:
+    pairs = zip(rows[f"{metric}_low"], rows[f"{metric}_high"], strict=True)
+    return ["" if pd.isna(low) else interval(low, high, metric) for low, high in pairs]
 
 
 def write_table(table: pd.DataFrame, stem: Path) -> None:

@@ -54,9 +54,9 @@ def agreement(claimed: Interval, claimed_maps: int, measured: Interval, measured
 
 
 def _variance(interval: Interval, maps: int) -> float:
-    """Return the variance of a mean over maps, from its interval: a bootstrap's, which divides by their number."""
+    """Return the variance of a mean over maps, from its interval, which is as wide as Student's."""
     half_width = (interval.high - interval.low) / 2.0
-    return float((half_width / stats.norm.ppf((1.0 + CONFIDENCE) / 2.0)) ** 2 * maps / (maps - 1))
+    return float((half_width / stats.t.ppf((1.0 + CONFIDENCE) / 2.0, maps - 1)) ** 2)
 
 
 def compared(name: str, card: Mapping[str, Any], again: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -1,0 +1,52 @@
+"""What the colours of figures and pages become on dark paper."""
+
+import numpy as np
+
+from rcdsac_trl.colors import DARK, LIGHT
+
+# Of the palette, those that stand in figures and pages. What a figure draws in white is its paper.
+_NAMED = (
+    *("card", "ink", "faint", "grid", "edge", "alarm"),
+    *("wall", "mapped", "unmapped", "unmapped_edge", "glass", "mover", "robot", "way", "touching"),
+)
+_NIGHT = {getattr(LIGHT, name): getattr(DARK, name) for name in _NAMED}
+# All others are told from the dark by a lightness in OKLab between these two, the lighter the darker they were.
+_DARKEST, _LIGHTEST = 0.93, 0.60
+_TO_CONES = np.array(
+    [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+)
+_TO_LAB = np.array(
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+)
+
+
+def at_night(color: str) -> str:
+    """Return what a colour becomes on dark paper.
+
+    The palette's become those of its dark theme. Of all others the lightness is turned round in OKLab (Ottosson, 2020):
+    they keep their hue, and colours in an order stay in one.
+
+    Args:
+        color: ``#rrggbb``.
+
+    Example:
+        >>> at_night(LIGHT.ink) == DARK.ink, at_night("#000000")
+        (True, '#e8e8e8')
+    """
+    if color in _NIGHT:
+        return str(_NIGHT[color])
+    stored = np.array(list(bytes.fromhex(color[1:]))) / 255.0
+    linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
+    lab = _TO_LAB @ np.cbrt(_TO_CONES @ linear)
+    lab[0] = _DARKEST + (_LIGHTEST - _DARKEST) * lab[0]
+    linear = np.linalg.solve(_TO_CONES, np.linalg.solve(_TO_LAB, lab) ** 3).clip(0.0, 1.0)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return "#" + bytes((255.0 * shown).round().astype(np.uint8).tolist()).hex()
