@@ -13,12 +13,19 @@ from rcdsac_trl.report.read import read_episodes
 HERE = Path(__file__).parent
 RESULTS = HERE.parents[1] / "results"
 REFERENCE = "sac"
+# Agents first, then what they are compared with; others behind them.
+ORDER = ("rcdsac_pow", "rcdsac_cvar", "dsac", "rcwr", "sac", "pursuit")
+
+
+def place(run: Path) -> int:
+    """Return where a run stands in the order."""
+    return next((i for i, name in enumerate(ORDER) if run.name.startswith(name)), len(ORDER))
 
 
 def main() -> None:
     """Read, draw."""
     # An agent or a baseline a folder; those of the study lie deeper, or are called otherwise.
-    episodes = read_episodes(sorted(RESULTS.glob("*-narrow")))
+    episodes = read_episodes(sorted(sorted(RESULTS.glob("*-narrow")), key=place))
     reference = episodes.conditions["agent"].tolist().index(REFERENCE)
     figures: dict[str, Figure | None] = {
         "beta_response": beta_response(episodes, "pow"),
