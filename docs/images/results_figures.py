@@ -1,32 +1,41 @@
-"""Draw beta_response.png, beta_response_cvar.png and differences_collisions.png, what `report` says of the agents.
+"""Draw beta_response.png, beta_response_cvar.png and differences_collisions.png, of what results/ holds.
 
 python docs/images/results_figures.py
 """
 
-import shutil
-import tempfile
 from pathlib import Path
 
+from matplotlib.figure import Figure
+
+from rcdsac_trl.report.figures import beta_response, paired_differences
 from rcdsac_trl.report.read import read_episodes
-from rcdsac_trl.report.write import write_report
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parents[1] / "results"
-# Folders of one training or baseline each, with its evaluation; those of the study lie deeper or are called otherwise.
-RUNS = sorted(RESULTS.glob("*-narrow"))
-PICTURES = {
-    "beta_response_pow.png": "beta_response.png",
-    "beta_response_cvar.png": "beta_response_cvar.png",
-    "differences_collisions_narrow.png": "differences_collisions.png",
-}
+REFERENCE = "sac"
+# Agents first, then what they are compared with; others behind them.
+ORDER = ("rcdsac_pow", "rcdsac_cvar", "dsac", "rcwr", "sac", "pursuit")
+
+
+def place(run: Path) -> int:
+    """Return where a run stands in the order."""
+    return next((i for i, name in enumerate(ORDER) if run.name.startswith(name)), len(ORDER))
 
 
 def main() -> None:
-    """Write the report, and keep these figures of it."""
-    with tempfile.TemporaryDirectory() as folder:
-        write_report(read_episodes(RUNS), RUNS, Path(folder))
-        for drawn, name in PICTURES.items():
-            shutil.copyfile(Path(folder) / drawn, HERE / name)
+    """Read, draw."""
+    # An agent or a baseline a folder; those of the study lie deeper, or are called otherwise.
+    episodes = read_episodes(sorted(sorted(RESULTS.glob("*-narrow")), key=place))
+    reference = episodes.conditions["agent"].tolist().index(REFERENCE)
+    figures: dict[str, Figure | None] = {
+        "beta_response": beta_response(episodes, "pow"),
+        "beta_response_cvar": beta_response(episodes, "cvar"),
+        "differences_collisions": paired_differences(episodes, reference, "collisions"),
+    }
+    for name, figure in figures.items():
+        if figure is None:
+            raise SystemExit(f"{name}.png: results/ has no agent that was driven at two betas")
+        figure.savefig(HERE / f"{name}.png", dpi=130)
 
 
 if __name__ == "__main__":
