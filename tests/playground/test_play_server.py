@@ -135,7 +135,7 @@ def test_one_page_too_many_gets_a_sentence(server: PlayServer) -> None:
     assert "static/js/bokeh.min.js" in _get(server, "/")
     status, told = _refused(server, "/")
     assert status == 503
-    assert told.startswith("1 pages drive already, and this server takes no more")
+    assert told.startswith("max_sessions=1, and so many pages drive already")
 
 
 @pytest.mark.parametrize("path", ["/", "/films/play-1.gif", "/static/js/bokeh.min.js"])

@@ -16,6 +16,8 @@ from rcdsac_trl.playground.palette import style_sheet
 _HERE = Path(__file__).parent
 _BAD_LINK, _UNKNOWN_NAME, _FULL = 400, 403, 503
 _WAYS_ON = {_BAD_LINK: '<a href="/">Open the usual scene.</a>', _FULL: '<a href="">Try again.</a>', _UNKNOWN_NAME: ""}
+# A page that found no room asks again by itself, s.
+_AGAIN_S = 5
 # What a browser leaves out of the name that it asks.
 _USUAL_PORTS = (80, 443)
 
@@ -67,7 +69,11 @@ class _Refused(Matcher):
 def _answer(request: HTTPServerRequest, status: int, sentence: str) -> None:
     page, css = ((_HERE / name).read_text("utf-8") for name in ("refusal.html", "page.css"))
     told = Template(page).substitute(
-        palettes=style_sheet(), css=css, sentence=escape(sentence) + ".", way_on=_WAYS_ON[status]
+        palettes=style_sheet(),
+        css=css,
+        sentence=escape(sentence) + ".",
+        way_on=_WAYS_ON[status],
+        again=f'<meta http-equiv="refresh" content="{_AGAIN_S}">\n' if status == _FULL else "",
     )
     body = told.encode()
     headers = HTTPHeaders(

@@ -44,6 +44,12 @@ if (!state.refused && window.location.search !== "?" + state.query)
   window.history.replaceState(null, "", "?" + state.query);
 
 if (window.playKeys === undefined) {
+  // Else who holds an obstacle for a moment, or has a slow machine, could not drag it: it would be a press.
+  try {
+    Bokeh.require("core/ui_gestures").UIGestures.press_threshold = 2 ** 31 - 1;
+  } catch (error) {
+    // Another Bokeh, which keeps its threshold elsewhere.
+  }
   window.playKeys = 0;
   window.addEventListener("keydown", (event) => {
     const at = event.composedPath()[0];

@@ -57,7 +57,7 @@ def usual_scene(offers: Offers) -> SceneChoice:
     alone = SceneChoice(next(iter(offers.agents)))
     (part,) = cast(alone, offers)
     dial = part.driver.dial
-    if dial is None:
+    if dial is None or part.driver.measure is None:  # without a measure, what is dialled is no beta
         return alone
     careful = round(dial.low + _CAREFUL * (dial.high - dial.low), 2)
     return SceneChoice(part.name, careful, second=part.name, beta2=dial.high)

@@ -58,6 +58,7 @@ class PlayPage:
         self.document, self.begun = document, False
         self._clock, self._studio = clock, studio
         self._theme = "light"
+        self._ended: str | None = None
         self._view: View | None = None
         self._said_aside: tuple[bool, tuple[str, list[str]]] = False, ("", [])
         # Views that the browser has not drawn yet: number, when it was sent, and how many steps it shows.
@@ -93,16 +94,21 @@ class PlayPage:
             self._clock.start()
             self.document.add_periodic_callback(self._look, _PERIOD_MS)
 
-    def close(self) -> None:
-        """End the drive: nobody looks any more."""
+    def close(self, why: str | None = None) -> None:
+        """End the drive: nobody looks any more.
+
+        Args:
+            why: a sentence for who looks again nevertheless.
+        """
         self._clock.close()
+        self._ended = why
 
     # ------------------------------------------------------------------------------------------- what it shows
     def _look(self) -> None:
         """Show the newest view, if there is one that was not shown and the browser has room for it."""
         clock, view, now_s = self._clock, self._clock.newest, time.monotonic()
-        if clock.refused is not None:
-            self._write(refusal_words(self._theme, clock.refused))
+        if (refused := clock.refused or self._ended) is not None:
+            self._write(refusal_words(self._theme, refused))
             return
         if self._view is not None and self._aside() != self._said_aside:
             self._say(self._view)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ipaddress import ip_address
 from pathlib import Path
+from weakref import WeakSet
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
@@ -62,7 +63,7 @@ class PlayServer:
         self._offers, self._host, self._max_sessions = offers, host, max_sessions
         self._studio = FilmStudio(films)
         self._pages: list[PlayPage] = []
-        self._clocks: list[DriveClock] = []
+        self._clocks: WeakSet[DriveClock] = WeakSet()  # one that drives is kept by its thread
         check_can_listen(host, port)  # Tornado leaves sockets open that it could not bind
         try:
             sockets, self.port = bind_sockets(host, port)
@@ -128,7 +129,7 @@ class PlayServer:
         except UserInputError:  # the gate has said so to who came through it
             return
         clock = DriveClock(link.choice, self._offers, running=link.running)
-        self._clocks = [*(clock for clock in self._clocks if clock.alive), clock]
+        self._clocks.add(clock)
         page = PlayPage(document, clock, link.theme, self._offers, self._studio)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._forget(page))
@@ -148,12 +149,12 @@ class PlayServer:
             return link
         watched = [session.document for session in self._server.get_sessions(_PATH) if session.connection_count]
         for page in [page for page in self._pages if page.begun and page.document not in watched]:
-            page.close()
+            page.close("this page was out of reach for a moment, and another one took its place: open it again")
             self._forget(page)
         if len(self._pages) >= self._max_sessions:
             raise TooManyPages(
-                f"{len(self._pages)} pages drive already, and this server takes no more: close one of them, or start "
-                "the server with a larger max_sessions"
+                f"max_sessions={self._max_sessions}, and so many pages drive already: close one of them, or start the "
+                "server with a larger number"
             )
         return link
 
