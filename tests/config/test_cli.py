@@ -244,6 +244,9 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
         ("course", "run=[sac-narrow,'']", "run"),
         ("report", "runs=['']", "runs"),
         ("publish", "runs=['']", "runs"),
+        ("agents", "agents=['']", "agents"),
+        ("verify", "agents=[sac-narrow,'']", "agents"),
+        ("verify", "out=", "out"),
     ],
 )
 def test_an_empty_name_is_not_the_folder_one_is_in(verb: str, given: str, key: str) -> None:
