@@ -23,7 +23,7 @@ from rcdsac_trl.config.experiment_settings import SearchSettings
 from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.measured_run import MeasuredRun
-from rcdsac_trl.report.card import driving_section
+from rcdsac_trl.report.card import measured_values
 from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.system.invocation import program
 from tiny import ROWS, TINY
@@ -244,6 +244,9 @@ def test_train_refuses_a_folder_that_holds_a_run(refusal: Callable, tiny_run: Pa
         ("course", "run=[sac-narrow,'']", "run"),
         ("report", "runs=['']", "runs"),
         ("publish", "runs=['']", "runs"),
+        ("agents", "agents=['']", "agents"),
+        ("verify", "agents=[sac-narrow,'']", "agents"),
+        ("verify", "out=", "out"),
     ],
 )
 def test_an_empty_name_is_not_the_folder_one_is_in(verb: str, given: str, key: str) -> None:
@@ -401,8 +404,8 @@ def test_a_command_makes_its_object_of_the_config_and_runs_it_with_what_describe
         done.append(cfg.num_maps)
         return Made()
 
-    Command("calibrate", make, describe="rcdsac_trl.report.card:driving_section")()
-    assert done == [7, 7, driving_section]  # checked before Hydra begins, and made then
+    Command("calibrate", make, describe="rcdsac_trl.report.card:measured_values")()
+    assert done == [7, 7, measured_values]  # checked before Hydra begins, and made then
     assert list(tmp_path.iterdir()) == []
 
 

@@ -23,7 +23,7 @@ from rcdsac_trl.errors import UserInputError, first_line
 
 _ABSENT = object()
 # Keys of verbs that name a folder, or a file of one, or several.
-_FOLDERS = ("run", "runs", "out", "films", "maps")
+_FOLDERS = ("run", "runs", "agents", "out", "films", "maps")
 
 
 def output_folder(config_name: str, overrides: list[str]) -> Path:
