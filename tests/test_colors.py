@@ -9,65 +9,18 @@ from pathlib import Path
 
 import matplotlib
 import matplotlib.colors
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import rcdsac_trl
-from rcdsac_trl.colors import BETA_SCALE, CAPTIONS, DARK, LIGHT, SERIES, Palette, beta_shades, faded, mixed, rgb, shades
+from rcdsac_trl.colors import BETA_SCALE, CAPTIONS, DARK, LIGHT, SERIES, Palette, beta_shades, faded, mixed, shades
+from vision import BLINDNESS, apart, contrast
 
 SOURCE = Path(rcdsac_trl.__file__).parent
 THEMES = pytest.mark.parametrize("palette", [LIGHT, DARK], ids=["light", "dark"])
 # What a reader of a map has to tell apart.
 THINGS = ("wall", "mapped", "unmapped", "mover", "robot", "way", "touching", "remembered", "obstacle")
-# Machado, Oliveira and Fernandes (2009), severity 1: linear RGB to linear RGB.
-BLINDNESS = {
-    "none": np.eye(3),
-    "deuteranopia": np.array(
-        [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
-    ),
-    "protanopia": np.array(
-        [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
-    ),
-    "tritanopia": np.array(
-        [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
-    ),
-}
 # How near two things may come in OKLab: the module's docstring says so.
 NEAREST = {"none": 0.10, "deuteranopia": 0.10, "protanopia": 0.06, "tritanopia": 0.05}
-# Ottosson (2020), from linear RGB.
-TO_CONES = np.array(
-    [
-        [0.4122214708, 0.5363325363, 0.0514459929],
-        [0.2119034982, 0.6806995451, 0.1073969566],
-        [0.0883024619, 0.2817188376, 0.6299787005],
-    ]
-)
-TO_OKLAB = np.array(
-    [
-        [0.2104542553, 0.7936177850, -0.0040720468],
-        [1.9779984951, -2.4285922050, 0.4505937099],
-        [0.0259040371, 0.7827717662, -0.8086757660],
-    ]
-)
-
-
-def linear(color: str) -> NDArray[np.float64]:
-    """Return linear RGB in [0, 1]."""
-    parts = np.array(rgb(color)) / 255.0
-    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
-
-
-def contrast(one: str, other: str) -> float:
-    """Return the contrast ratio of WCAG 2.2."""
-    darker, lighter = sorted(float(linear(color) @ [0.2126, 0.7152, 0.0722]) for color in (one, other))
-    return (lighter + 0.05) / (darker + 0.05)
-
-
-def apart(one: str, other: str, blindness: str) -> float:
-    """Return the distance of two colours in OKLab, as such a reader sees them."""
-    seen = [TO_OKLAB @ np.cbrt(TO_CONES @ np.clip(BLINDNESS[blindness] @ linear(c), 0.0, 1.0)) for c in (one, other)]
-    return float(np.linalg.norm(seen[0] - seen[1]))
 
 
 def test_the_measures_are_those_of_their_authors() -> None:
@@ -83,7 +36,7 @@ def test_things_contrast_with_the_floor(palette: Palette) -> None:
     colors = asdict(palette)
     weak = {name: contrast(colors[name], palette.floor) for name in (*THINGS, "goal", "hit", "trail")}
     assert min(weak.values()) >= 3.0, weak
-    for name in ("ink", "faint", "accent", "alarm"):
+    for name in ("ink", "faint", "accent", "alarm", "good", "unsure"):
         for behind in ("page", "card"):
             assert contrast(colors[name], colors[behind]) >= 4.5, (name, behind)
     assert contrast(palette.arrow, palette.robot) >= 3.0
@@ -95,6 +48,13 @@ def test_things_are_told_apart_by_colour_blind_readers(palette: Palette, blindne
     colors = asdict(palette)
     near = {pair: apart(colors[pair[0]], colors[pair[1]], blindness) for pair in itertools.combinations(THINGS, 2)}
     assert min(near.values()) >= NEAREST[blindness], min(near, key=near.__getitem__)
+
+
+@THEMES
+@pytest.mark.parametrize("blindness", BLINDNESS)
+def test_verdicts_are_told_apart_by_colour_blind_readers(palette: Palette, blindness: str) -> None:
+    for one, other in itertools.combinations((palette.good, palette.alarm, palette.unsure, palette.faint), 2):
+        assert apart(one, other, blindness) >= 0.045, (one, other)
 
 
 def test_curves_are_told_apart_by_colour_blind_readers() -> None:

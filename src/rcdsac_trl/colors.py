@@ -7,7 +7,8 @@ wall.
 They are chosen for readers who cannot tell red from green, too. What stands or drives on a map contrasts with its floor
 by 3:1 or more, texts with what is behind them by 4.5:1 or more (WCAG 2.2). Under deuteranopia, simulated at full
 severity (Machado, Oliveira and Fernandes 2009), any two such things stay 0.10 or more apart in OKLab, under protanopia
-0.06, under tritanopia 0.05; about 0.02 is what an eye just sees. `tests/test_colors.py` computes all of it.
+0.06, under tritanopia 0.05; verdicts, which are words, too, stay 0.045 apart. About 0.02 is what an eye just sees.
+`tests/test_colors.py` computes all of it.
 
 Example:
     >>> LIGHT.robot, rgb(LIGHT.robot)
@@ -35,9 +36,12 @@ class Palette:
         faint: texts and lines that stand back.
         accent: what can be clicked, and curves of what is expected.
         alarm: texts that warn, and the worst part of what is expected.
+        good: texts of what holds.
+        unsure: texts of what cannot be told.
         outside: around a map.
         floor: of a map.
         wall: mapped, as all walls are.
+        inner_wall: where figures tell it from walls around a map.
         mapped: clutter that the planner knows.
         mapped_edge: its outline.
         unmapped: clutter that only the sensor shows.
@@ -68,9 +72,12 @@ class Palette:
     faint: str
     accent: str
     alarm: str
+    good: str
+    unsure: str
     outside: str
     floor: str
     wall: str
+    inner_wall: str
     mapped: str
     mapped_edge: str
     unmapped: str
@@ -102,9 +109,12 @@ LIGHT = Palette(
     faint="#666e7c",
     accent="#1567c6",
     alarm="#c81e1e",
+    good="#00755a",
+    unsure="#5e3a10",
     outside="#dee1e6",
     floor="#fafaf8",
     wall="#373d4a",
+    inner_wall="#5b6272",
     mapped="#868fa2",
     mapped_edge="#5d677c",
     unmapped="#ce7f06",
@@ -137,9 +147,12 @@ DARK = Palette(
     faint="#98a1b0",
     accent="#6aa9f7",
     alarm="#ff7d6e",
+    good="#3fdca2",
+    unsure="#ffd27f",
     outside="#12151b",
     floor="#1e232b",
     wall="#959eaf",
+    inner_wall="#7e889b",
     mapped="#626c83",
     mapped_edge="#838da4",
     unmapped="#f0b548",

@@ -1,5 +1,6 @@
 """The page of a report: what it is made of, and how a browser shows it."""
 
+import itertools
 import re
 import shutil
 from collections.abc import Iterator
@@ -12,23 +13,13 @@ from matplotlib.figure import Figure
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from rcdsac_trl.colors import DARK, SERIES, shades
+from rcdsac_trl.report.figures import THING_COLORS
 from rcdsac_trl.report.night import at_night
 from rcdsac_trl.report.page import Card, Figures, Folded, Heading, Picture, Section, page, svg
 from rcdsac_trl.report.style import FAINT, GRID, INK, PAPER, VERDICTS, series, style
+from vision import BLINDNESS, apart, contrast, luminance
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-def luminance(color: str) -> float:
-    """WCAG 2.2's relative luminance."""
-    stored = np.array(list(bytes.fromhex(color[1:]))) / 255.0
-    linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
-
-
-def contrast(one: str, other: str) -> float:
-    low, high = sorted((luminance(one), luminance(other)))
-    return (high + 0.05) / (low + 0.05)
 
 
 @pytest.mark.parametrize("color", [INK, *VERDICTS.values()])
@@ -45,6 +36,21 @@ def test_lines_can_be_seen_by_night_and_stay_in_their_order() -> None:
     named = [at_night(color) for color in series(len(SERIES))]
     assert min(contrast(color, DARK.card) for color in [*by_night, *named, at_night(FAINT)]) > 3.0
     assert contrast(at_night(GRID), DARK.card) < 2.0
+
+
+@pytest.mark.parametrize("blindness", BLINDNESS)
+@pytest.mark.parametrize("by_day", [SERIES, tuple(THING_COLORS.values()), tuple(VERDICTS.values())])
+def test_colours_are_told_apart_by_night_too(by_day: tuple[str, ...], blindness: str) -> None:
+    for one, other in itertools.combinations(map(at_night, by_day), 2):
+        assert apart(one, other, blindness) >= 0.05, (one, other)
+
+
+def test_walls_and_clutter_stand_back_by_night_in_the_order_of_the_day() -> None:
+    things = [THING_COLORS[name] for name in ("outer_wall", "inner_wall", "mapped_clutter")]
+    for theme, colors in ((PAPER, things), (DARK.card, [at_night(color) for color in things])):
+        contrasts = [contrast(color, theme) for color in colors]
+        assert contrasts == sorted(contrasts, reverse=True)
+        assert contrasts[-1] > 3.0
 
 
 def figure() -> Figure:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
-from rcdsac_trl.colors import LIGHT, mixed
+from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report import statistics
 from rcdsac_trl.report.collision_report import THINGS
 from rcdsac_trl.report.findings import TAILS, bounded, labels
@@ -28,13 +28,14 @@ _RESPONSES: dict[str, tuple[str, Statistic]] = {
     f"reward: all (dashed) and the worst {TAILS[0]:.0%}": ("reward", statistics.cvar(TAILS[0])),
 }
 _LEARNT = ("reward", "collisions")
-_THING_COLORS = {
+THING_COLORS = {
     "outer_wall": LIGHT.wall,
-    "inner_wall": mixed(LIGHT.wall, LIGHT.mapped, 0.45),
+    "inner_wall": LIGHT.inner_wall,
     "mapped_clutter": LIGHT.mapped,
     "unmapped_clutter": LIGHT.unmapped,
     "mover": LIGHT.mover,
 }
+"""Colours of what is hit."""
 _OUTSIDE = "////"  # hatching
 PANEL = (4.6, 3.3)
 """Size of a panel in inches: its texts can be read on a telephone, and two of them stand side by side on a desk."""
@@ -201,14 +202,14 @@ def collision_causes(summary: pd.DataFrame) -> Figure:
         for thing in (thing for thing in THINGS if thing in parts.index):
             outside = parts.at[thing, "per_episode"] * parts.at[thing, "outside_share"]
             for width, hatch in ((parts.at[thing, "per_episode"] - outside, ""), (outside, _OUTSIDE)):
-                axes.barh(row, width, 0.34, left, color=_THING_COLORS[thing], hatch=hatch, edgecolor=PAPER, linewidth=0)
+                axes.barh(row, width, 0.34, left, color=THING_COLORS[thing], hatch=hatch, edgecolor=PAPER, linewidth=0)
                 left += width
         axes.annotate(f"{left:.2f}", (left, row), xytext=(5, 0), textcoords="offset points", va="center", color=INK)
     style(axes, "What was hit", "collisions an episode")
     axes.set_xlim(left=0)
     axes.margins(x=0.14)
     _name_rows(axes, names)
-    handles = [Patch(color=_THING_COLORS[thing], label=name) for thing, name in THINGS.items()]
+    handles = [Patch(color=THING_COLORS[thing], label=name) for thing, name in THINGS.items()]
     handles.append(Patch(facecolor=FAINT, hatch=_OUTSIDE, edgecolor=PAPER, label="outside the sensor's sectors"))
     figure.legend(handles=handles, loc="outside lower left", ncols=1, frameon=False, fontsize=9, labelcolor=INK)
     return figure

@@ -4,10 +4,11 @@ import numpy as np
 
 from rcdsac_trl.colors import DARK, LIGHT
 
-# Of the palette, those that stand in figures and pages. What a figure draws in white is its paper.
+# Of the palette, those that stand in figures and pages. What a figure draws in white is its paper. Where two are one
+# colour by day, the later counts: curves in `touching` stay farther from the others than in `alarm`.
 _NAMED = (
-    *("card", "ink", "faint", "grid", "edge", "alarm"),
-    *("wall", "mapped", "unmapped", "unmapped_edge", "glass", "mover", "robot", "way", "touching"),
+    *("card", "ink", "faint", "grid", "edge", "alarm", "good", "unsure"),
+    *("wall", "inner_wall", "mapped", "unmapped", "glass", "mover", "robot", "way", "touching"),
 )
 _NIGHT = {getattr(LIGHT, name): getattr(DARK, name) for name in _NAMED}
 # All others are told from the dark by a lightness in OKLab between these two, the lighter the darker they were.

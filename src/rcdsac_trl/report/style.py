@@ -9,9 +9,9 @@ from rcdsac_trl.colors import LIGHT, SERIES
 
 INK, FAINT, GRID, PAPER = LIGHT.ink, LIGHT.faint, LIGHT.grid, LIGHT.card
 VERDICTS = {
-    "holds": LIGHT.way,
+    "holds": LIGHT.good,
     "does not hold": LIGHT.alarm,
-    "cannot be told": LIGHT.unmapped_edge,
+    "cannot be told": LIGHT.unsure,
     "runs missing": LIGHT.faint,
 }
 """Colours of the words of verdicts."""
