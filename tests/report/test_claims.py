@@ -285,7 +285,8 @@ def test_the_course_by_the_papers_own_numbers() -> None:
         found[0]
     )
     assert course_verdicts(driven(sac=0.0))[0] == "does not hold"
-    assert course_verdicts(driven(dsac_pow=9.0))[0] == "does not hold"
+    assert course_verdicts(driven())[4] == "holds"
+    assert [course_verdicts(driven(dsac_pow=9.0))[number] for number in (0, 4)] == ["does not hold"] * 2
     runs = driven()
     bold = runs["agent"].str.startswith("rcdsac") & runs["beta"].isin([0.75, -1.0])
     assert course_verdicts(runs.assign(collisions=runs["collisions"].mask(bold, 4)))[1] == "holds"

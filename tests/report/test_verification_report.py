@@ -9,12 +9,10 @@ from scipy import stats
 from rcdsac_trl.report.statistics import Array, Interval, bootstrap
 from rcdsac_trl.report.verification_report import agreement, compared, with_verdicts
 
-Z = stats.norm.ppf(0.975)
-
 
 def interval(mean: float, standard_error: float, maps: int) -> Interval:
-    """Return the interval that a bootstrap of so many maps gives on the mean."""
-    half_width = Z * standard_error * math.sqrt((maps - 1) / maps)
+    """Return the interval that so many maps give on the mean: Student's."""
+    half_width = stats.t.ppf(0.975, maps - 1) * standard_error
     return Interval(mean, mean - half_width, mean + half_width)
 
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from rcdsac_trl.report.course_table import paper_course
 from rcdsac_trl.report.statistics import Array
-from rcdsac_trl.report.verdicts import Cell, Claim, Finding, Group, Measured, find, than
+from rcdsac_trl.report.verdicts import Cell, Claim, Expectation, Finding, Group, Measured, find, than
 
 COURSE = "office course"
 """Stands for the sensor in tables of claims."""
@@ -46,6 +46,11 @@ def course_claims() -> list[Claim]:
             tuple(than(slowest, "more", other, "time_s") for other in others),
         ),
         Claim("RC-DSAC takes about as long as DSAC", COURSE, (than(ours, "comparable", theirs, "time_s"),)),
+        Claim(
+            "DSAC never collides",
+            COURSE,
+            (Expectation((theirs,), (1.0,), "collisions", "comparable", "Above none by"),),
+        ),
     ]
 
 

@@ -39,7 +39,7 @@ def agreement(claimed: Interval, claimed_maps: int, measured: Interval, measured
 
     Example:
         >>> round(agreement(Interval(1.0, 0.8, 1.2), 50, Interval(1.3, 1.05, 1.55), 50), 3)
-        0.072
+        0.063
         >>> agreement(Interval(0.0, 0.0, 0.0), 50, Interval(0.0, 0.0, 0.0), 30)
         1.0
     """
