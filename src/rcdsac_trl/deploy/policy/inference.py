@@ -270,21 +270,24 @@ class Critics:
     def _values(self, read: Array, actions: Array, gate: Array | None) -> Array:
         """Return each critic's quantiles of several actions as they come, [C, K, N], or [C, K, 1] of scalar critics."""
         told = np.concatenate((actions, look_ahead(read[0], actions)), axis=1) if self._looks_ahead else actions
-        critics, size = read.shape
-        joined = np.empty((critics, len(told), size + told.shape[1]), dtype=np.float32)
-        joined[:, :, :size], joined[:, :, size:] = read[:, None], told
-        x = _rectified(joined, self._input)
+        weight, bias = self._input
+        size = read.shape[1]
+        # What was read is the same for all actions.
+        x = read[:, None] @ weight[:, :size] + told @ weight[:, size:]
+        x += bias
+        x = np.maximum(x, _ZERO, out=x)[:, :, None]
         if gate is not None:
-            gated = x[:, :, None] * gate[:, None]
-            x = gated.reshape(critics, -1, gated.shape[-1])
-        weight, bias = self._output
-        values = _rectified(x, self._hidden) @ weight
-        values += bias
-        return values.reshape(critics, len(told), -1)
+            x = x * gate[:, None]
+        # A product an action, as far as BLAS goes: it would share a larger one among threads, which on a busy computer
+        # wait for each other much longer than they multiply.
+        hidden, output = ((weight[:, None], bias[:, None]) for weight, bias in (self._hidden, self._output))
+        values = _rectified(x, hidden) @ output[0]
+        values += output[1]
+        return values[..., 0]
 
 
 def _rectified(x: Array, layer: tuple[Array, Array]) -> Array:
-    """Return max(0, x W + b), [E, n, out], for x [n, in] or [E, n, in]."""
+    """Return max(0, x W + b), [E, .., n, out], for x [n, in] or [E, .., n, in]."""
     weight, bias = layer
     y = x @ weight
     y += bias
