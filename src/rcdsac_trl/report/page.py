@@ -254,7 +254,7 @@ def _table(table: pd.DataFrame) -> str:
     head.append(f"<tr>{''.join(names)}</tr>")
     rows = []
     for first, *rest in table.astype(str).to_numpy().tolist():
-        cells = (f"<td{kind}>{escape(cell)}</td>" for cell, kind in zip(rest, kinds[1:], strict=True))
+        cells = (f"<td{kind}>{_unbroken(cell)}</td>" for cell, kind in zip(rest, kinds[1:], strict=True))
         rows.append(f"<tr><th{kinds[0]} scope=row>{_unbroken(first)}</th>{''.join(cells)}</tr>")
     inside = f"<table><thead>{''.join(head)}</thead><tbody>{''.join(rows)}</tbody></table>"
     return _scrolling("table", f"Table: {', '.join(name for _, name in columns)}", inside)
