@@ -126,6 +126,14 @@ def test_all_and_any() -> None:
     assert "Strongest: b: 1.00" in numbers(against_three(1.0, 1.95, 3.0, quantifier="any"))
 
 
+def test_the_weakest_is_the_one_that_decides() -> None:
+    """Nearer to a, but for sure below it, is b; c cannot be told from a."""
+    claim = Claim("b and c collide less", "narrow", tuple(than(group(name), "less", group("a")) for name in "bc"))
+    found = find(claim, measured(a=maps_around(2.0), b=maps_around(1.5), c=maps_around(1.0, spread=8.0, seed=3)))
+    assert found.verdict == Verdict.OPEN
+    assert numbers(found).startswith("2 comparisons: 1 as claimed, 1 cannot be told. Weakest: c: 1.00")
+
+
 def test_one_of_many_must_fail_by_more_than_one_alone() -> None:
     """What seems to fail at 95 % for itself, is one of three: the claim needs 98.3 %."""
     alone = Claim("d collides less", "narrow", (than(group("d"), "less", group("a")),))

@@ -118,10 +118,11 @@ class Judged:
     verdict: Verdict
 
     @property
-    def against(self) -> float:
-        """How much the numbers speak against what was expected."""
+    def against(self) -> tuple[int, float]:
+        """How much the numbers speak against what was expected: by the verdict, then by the difference."""
         value = self.interval.value
-        return {"less": value, "more": -value, "comparable": abs(value)}[self.expectation.expected]
+        verdict = (Verdict.HOLDS, Verdict.OPEN, Verdict.FAILS).index(self.verdict)
+        return verdict, {"less": value, "more": -value, "comparable": abs(value)}[self.expectation.expected]
 
 
 @dataclass(frozen=True)
