@@ -206,8 +206,9 @@ def test_a_sum_of_means_by_hand() -> None:
     first, second = layout([1.0, 3.0], [2.0, 2.0]), layout([0.0, 0.0], [1.0, 1.0])
     found = statistics.contrast([statistics.Term(2.0, first, "a"), statistics.Term(-1.0, second, "b")])
     assert vars(found) == pytest.approx({"value": 3.5, "low": found.low, "high": found.high})
-    # By map 4 and 3, paired: two maps, t 12.71 and deviation 0.71 give 3.5 ± 6.4.
-    assert found.high - found.low == pytest.approx(2 * 12.71 * 0.5**0.5 / 2**0.5, rel=0.1)
+    # By map 4 and 3, paired: a quarter of the resamples are one map twice, 0.5 from the mean, as many the other.
+    # Spread by t of 1 degree of freedom over the normal's, 12.706 / 1.960, and by the root of 2 / (2 - 1): 3.5 ± 4.58.
+    assert (found.low, found.high) == pytest.approx((3.5 - 4.584, 3.5 + 4.584), abs=0.001)
 
 
 def test_a_map_without_a_value_is_left_out_of_a_sum() -> None:

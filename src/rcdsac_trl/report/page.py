@@ -233,10 +233,10 @@ def _scrolling(what: str, says: str, inside: str) -> str:
 
 
 def _card(card: Card) -> str:
-    notes = "".join(f'<p class="note">{escape(note)}</p>' for note in card.notes if note)
-    text = f"<p>{escape(card.text)}</p>" if card.text else ""
+    notes = "".join(f'<p class="note">{_unbroken(note)}</p>' for note in card.notes if note)
+    text = f"<p>{_unbroken(card.text)}</p>" if card.text else ""
     return (
-        f'<article class="card" style="--told: {VERDICTS[card.verdict]}"><h4>{escape(card.heading)}: '
+        f'<article class="card" style="--told: {VERDICTS[card.verdict]}"><h4>{_unbroken(card.heading)}: '
         f"<b>{escape(card.verdict)}</b></h4>{text}{notes}</article>"
     )
 
@@ -254,8 +254,8 @@ def _table(table: pd.DataFrame) -> str:
     head.append(f"<tr>{''.join(names)}</tr>")
     rows = []
     for first, *rest in table.astype(str).to_numpy().tolist():
-        cells = (f"<td{kind}>{escape(cell)}</td>" for cell, kind in zip(rest, kinds[1:], strict=True))
-        rows.append(f"<tr><th{kinds[0]} scope=row>{_unbroken(escape(first))}</th>{''.join(cells)}</tr>")
+        cells = (f"<td{kind}>{_unbroken(cell)}</td>" for cell, kind in zip(rest, kinds[1:], strict=True))
+        rows.append(f"<tr><th{kinds[0]} scope=row>{_unbroken(first)}</th>{''.join(cells)}</tr>")
     inside = f"<table><thead>{''.join(head)}</thead><tbody>{''.join(rows)}</tbody></table>"
     return _scrolling("table", f"Table: {', '.join(name for _, name in columns)}", inside)
 
@@ -268,8 +268,8 @@ def _kind(cells: Sequence[str]) -> str:
 
 
 def _unbroken(text: str) -> str:
-    """Keep a symbol on one line with its value."""
-    return text.replace(" = ", "\u00a0=\u00a0")
+    """Return an escaped text that keeps a symbol on one line with its value."""
+    return escape(text).replace(" = ", "\u00a0=\u00a0")
 
 
 def _anchor(heading: str) -> str:
