@@ -7,7 +7,7 @@ import pandas as pd
 from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.figures import learning_curves
 
-RESULTS = Path(__file__).parents[2] / "results"
+RESULTS = Path(__file__).parents[2] / "results" / "rules-1"
 # Iterations that make one point: 150 episodes a seed.
 TOGETHER = 15
 UPDATES_PER_ITERATION = 200

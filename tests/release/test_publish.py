@@ -196,7 +196,14 @@ def test_half_precision_keeps_actions_and_quantiles_within_bounds(name: str) -> 
     check_rounding(name, differences)
 
 
-def test_an_agent_that_rounding_changes_is_not_published() -> None:
+def test_an_agent_that_rounding_changes_is_not_published(
+    evaluated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as stricter:
+        stricter.setitem(LIMITS, "linear_speed_m_per_s", 0.0)
+        with pytest.raises(FaultError, match=r"of rcdsac_pow-narrow by .*, more than 0: nothing was published"):
+            publish(evaluated, tmp_path)
+    assert list(tmp_path.iterdir()) == []
     one = agent(**RCWR)
     louder = replace(one, tensors={n: v * (1.5 if n.startswith("actor") else 1.0) for n, v in one.tensors.items()})
     differences = largest_differences(one, louder, steps=5)

@@ -102,12 +102,13 @@ class Publication:
             describe: returns the measured numbers of folders.
 
         Raises:
-            FaultError: if half precision changes one too much; it is not written then.
+            FaultError: if half precision changes one too much; nothing is written then.
         """
+        differences = {name: largest_differences(agent.weights, agent.small) for name, agent in self.agents.items()}
+        for name, changed in differences.items():
+            check_rounding(name, changed)
         for name, agent in self.agents.items():
-            differences = largest_differences(agent.weights, agent.small)
-            check_rounding(name, differences)
-            measured = agent.measured(name, differences, describe)
+            measured = agent.measured(name, differences[name], describe)
             # The tables come first: who finds weights finds what is said of them.
             evaluation = agent.evaluation.relative_to(agent.run)
             for path in (*map(Path, _TABLES), *(evaluation / file for file in _EVALUATION)):

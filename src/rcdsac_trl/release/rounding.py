@@ -85,6 +85,6 @@ def check_rounding(name: str, differences: dict[str, float]) -> None:
     for quantity, by in differences.items():
         if not by <= LIMITS[quantity]:
             raise FaultError(
-                f"half precision changes {quantity} of {name} by {by:.2g}, more than {LIMITS[quantity]:g}: it was not "
-                "published; `export` writes it in single precision"
+                f"half precision changes {quantity} of {name} by {by:.2g}, more than {LIMITS[quantity]:g}: nothing was "
+                "published; leave its run out, and `export` it, in single precision"
             )
