@@ -143,7 +143,7 @@ def test_accelerator(
 
 def test_a_graph_s_batch_is_filled_again_where_it_lies(load: Any) -> None:
     program = load("accelerator")
-    learner = load("bench_common").make_learner("rcdsac_pow", SMALL)
+    learner = load("bench_common").make_learner("rcdsac_pow", [*SMALL, "learner.resample_per=sequence"])
     first, second = program.prepared(learner), program.prepared(learner)
     static = first.apply(program.held)
     assert first["risk"].stride(1) == static["risk"].stride(1) == 0
