@@ -55,12 +55,12 @@ def targets_are_critics(loss: LossModule) -> bool:
 
 # ------------------------------------------------------------------------------------------------ what is chosen
 def test_an_agent_goes_on_as_what_it_is() -> None:
-    shipped = named_agent("rcdsac_pow-narrow").settings
-    found = settings("init=rcdsac_pow-narrow", "map=hard")
+    shipped = named_agent("dsac_pow-narrow").settings
+    found = settings("init=dsac_pow-narrow", "map=hard")
     assert (found.algo, found.sensor, found.robot) == (shipped.algo, shipped.sensor, shipped.robot)
     assert found.network == shipped.network
     assert found.network.padding == "none"  # which training's defaults are not
-    plain = settings("+algo=rcdsac_pow", "map=hard")
+    plain = settings("+algo=dsac_pow", "algo.beta=-1", "map=hard")
     assert found.map == plain.map != shipped.map
     assert found.learner == plain.learner  # hyper-parameters are today's
     early = (found.schedule.pursuit_iterations, found.schedule.neutral_iterations, found.schedule.ramp_iterations)
@@ -75,7 +75,7 @@ def test_what_a_user_chooses_holds() -> None:
         "schedule.pursuit_iterations=2",
         "robot.max_speed_m_per_s=0.3",
     )
-    for overrides in (("init=rcdsac_pow-narrow", *given), (*given, "init=rcdsac_pow-narrow")):
+    for overrides in (("init=dsac_pow-narrow", *given), (*given, "init=dsac_pow-narrow")):
         found = settings(*overrides)
         assert (found.algo.name, found.sensor.name) == ("rcdsac_cvar", "sparse")
         assert (found.schedule.pursuit_iterations, found.robot.max_speed_m_per_s) == (2, 0.3)
@@ -156,12 +156,22 @@ def test_an_exported_agents_average_stands_for_what_it_lacks(tiny_run: Path, tmp
 
 def test_a_shipped_agent_on_another_map_robot_and_measure(tmp_path: Path) -> None:
     trainer = begun(
-        "rcdsac_pow-narrow", tmp_path / "run", "+algo=rcdsac_cvar", "robot=turtlebot3_burger", "sensor=full"
+        "rcdsac_pow-narrow",
+        tmp_path / "run",
+        "+algo=rcdsac_cvar",
+        "robot=turtlebot3_burger",
+        "sensor=full",
+        "sensor.memory_s=12",
     )
     told = (tmp_path / "run" / "train.log").read_text()
-    assert "not copied: temperature (unknown: learner.alpha_init=" in told
+    assert "not copied: learning actor and target critics (the averaged actor and the critics stand for them), " in told
     assert "; measure pow becomes cvar; sensor narrow becomes full; robot paper becomes turtlebot3_burger\n" in told
     assert_equal_states(trainer.learner.average.module, named_agent("rcdsac_pow-narrow").load()[1].module)
+
+
+def test_a_temperature_that_nobody_knows_is_said(tmp_path: Path) -> None:
+    begun("dsac_pow-narrow", tmp_path / "run")
+    assert "not copied: temperature (unknown: learner.alpha_init=" in (tmp_path / "run" / "train.log").read_text()
 
 
 def test_other_networks_are_refused_before_anything_is_written(tiny_run: Path, tmp_path: Path) -> None:

@@ -66,6 +66,7 @@ VERBS = {
             "run=rcdsac_pow-narrow beta=[-2,-0.5] map=hard": "a shipped agent, on another map set",
             "baseline=mppi num_maps=10": "a classical planner, on fewer maps",
         },
+        keys=("acting",),
     ),
     "report": Verb(
         does="compare evaluations: the paper's tables and claims, statistics and figures",

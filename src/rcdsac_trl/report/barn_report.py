@@ -60,9 +60,12 @@ def write_barn(folder: Path) -> str:
 
 
 def _over_worlds(runs: pd.DataFrame, metric: str) -> Interval:
-    """Return the mean over worlds: runs in one world are no independent observations."""
+    """Return the mean over worlds: runs in one world are no independent observations.
+
+    Its interval leaves out what cannot be, which those over a few worlds reach: shares and scores lie in [0, 1].
+    """
     table = runs.pivot(index="world", columns="run", values=metric)
-    return bootstrap(table.to_numpy(float)[None])
+    return bootstrap(table.to_numpy(float)[None]).within(0.0, math.inf if metric == "time_s" else 1.0)
 
 
 def _columns(found: dict[str, Interval]) -> dict[str, float]:

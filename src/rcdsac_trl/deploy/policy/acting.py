@@ -75,7 +75,7 @@ class ActingSettings:
         every step, on every machine.
 
         Example:
-            >>> ActingSettings(num_candidates=3, spread=2.0).noise().round(2).tolist()
+            >>> ActingSettings(num_candidates=3, spread=2.0).noise().astype(float).round(2).tolist()
             [[0.0, 0.0], [-1.12, 1.02], [0.29, -3.32]]
         """
         number = self.num_candidates - 1
