@@ -1,9 +1,8 @@
 """How colours are seen: contrasts and distances, also by colour-blind readers."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rcdsac_trl.colors import rgb
+from rcdsac_trl.report.night import TO_CONES, TO_OKLAB, linear
 
 # Machado, Oliveira and Fernandes (2009), severity 1: linear RGB to linear RGB.
 BLINDNESS = {
@@ -18,27 +17,6 @@ BLINDNESS = {
         [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
     ),
 }
-# Ottosson (2020), from linear RGB.
-TO_CONES = np.array(
-    [
-        [0.4122214708, 0.5363325363, 0.0514459929],
-        [0.2119034982, 0.6806995451, 0.1073969566],
-        [0.0883024619, 0.2817188376, 0.6299787005],
-    ]
-)
-TO_OKLAB = np.array(
-    [
-        [0.2104542553, 0.7936177850, -0.0040720468],
-        [1.9779984951, -2.4285922050, 0.4505937099],
-        [0.0259040371, 0.7827717662, -0.8086757660],
-    ]
-)
-
-
-def linear(color: str) -> NDArray[np.float64]:
-    """Return linear RGB in [0, 1]."""
-    parts = np.array(rgb(color)) / 255.0
-    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
 
 
 def luminance(color: str) -> float:

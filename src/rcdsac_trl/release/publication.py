@@ -201,7 +201,8 @@ def _evaluation_of(run: Path, checkpoint: Name, digest: str, acting: ActingSetti
         found[path.parent] = ((described["map"], described["task"]) == default, driven == digest, number)
     if not found:
         called = f"{program()} evaluate {assigned('run', run.as_posix())} checkpoint={checkpoint} half_precision=true"
-        called += "".join(f" acting.{name}={value}" for name, value in asdict(acting).items() if acting.chooses)
+        if acting.chooses:
+            called += "".join(f" acting.{name}={value}" for name, value in asdict(acting).items())
         stale = f" ({others} are of other weights: it was trained on)" if others else ""
         raise UserInputError(
             f"{run} has no evaluation of its checkpoint {checkpoint} that acts by {acting}{stale}: {called}"

@@ -5,11 +5,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from rcdsac_trl.deploy.policy.acting import NUM_FRACTIONS, ActingSettings
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.distortion import PSI, distorted, fractions_of
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics
-from rcdsac_trl.deploy.policy.weights import AgentConfig
 from rcdsac_trl.errors import UserInputError
 
+# The largest sum over the critics is where the largest mean is.
 _OVER: Mapping[str, np.ufunc] = {"minimum": np.minimum, "mean": np.add}
 
 
