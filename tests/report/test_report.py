@@ -190,6 +190,18 @@ def test_the_same_agent_twice_is_refused_but_another_training_seed_is_not(tmp_pa
     assert values.mean((1, 2)).tolist() == [1.0, 3.0]
 
 
+def test_seeds_of_an_agent_that_act_differently_are_not_averaged(tmp_path: Path) -> None:
+    choice = {"num_candidates": 32, "spread": 1.0, "over_critics": "minimum"}
+    chooses = evaluate(tmp_path / "chooses", "sac", {NONE: 0}, acting=choice)
+    before = evaluate(tmp_path / "before", "sac", {NONE: 2}, train_seed=1)  # of a version that knew no choice
+    with pytest.raises(UserInputError, match=r"let sac act differently \(acting.num_candidates=32 .* and .*=1\)"):
+        read_episodes([chooses, before])
+    mean = evaluate(tmp_path / "mean", "sac", {NONE: 2}, train_seed=2, acting=choice | {"num_candidates": 1})
+    assert len(read_episodes([before, mean]).conditions) == 1
+    other = evaluate(tmp_path / "other", "rcwr", {NONE: 2})  # another agent may
+    assert len(read_episodes([chooses, other]).conditions) == 2
+
+
 def test_what_is_no_evaluation_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match="name what to report on"):
         read_episodes([])

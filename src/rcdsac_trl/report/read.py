@@ -187,12 +187,14 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
         folders: as for :func:`find_evaluations`.
 
     Raises:
-        UserInputError: if there are none, if maps, starts, goals or rules differ, or if two hold the same.
+        UserInputError: if there are none, if maps, starts, goals or rules differ, if training seeds of one agent act
+            differently, or if two hold the same.
     """
     if not folders:
         raise UserInputError("name what to report on: runs=[<folder>,...] of runs or of their evaluations")
     evaluations = [read_evaluation(folder) for folder in find_evaluations(folders)]
     _check_same_maps(evaluations)
+    _check_same_acting(evaluations)
     tables = [
         evaluation.episodes.assign(
             agent=evaluation.described["agent"],
@@ -244,6 +246,28 @@ def _check_same_maps(evaluations: Sequence[Evaluation]) -> None:
                 f"{first.folder} and {other.folder} are of two robots ({names}, or one with other numbers), whose "
                 "results do not compare: report on them apart"
             )
+
+
+def _check_same_acting(evaluations: Sequence[Evaluation]) -> None:
+    """Refuse to call one agent what chooses its actions in two ways: its seeds would be averaged."""
+    firsts: dict[tuple[str, str], Evaluation] = {}
+    for other in evaluations:
+        agent = other.described["agent"], other.described["sensor"]
+        first = firsts.setdefault(agent, other)
+        here, there = _acting_of(first), _acting_of(other)
+        if here != there:
+            raise UserInputError(
+                f"{first.folder} and {other.folder} let {agent[0]} act differently ({here} and {there}): evaluate them "
+                "with the same acting.*, or report on them apart"
+            )
+
+
+def _acting_of(evaluation: Evaluation) -> str:
+    """Say how an agent acted; evaluations of earlier versions say nothing, all by tanh(mean)."""
+    acting = evaluation.described.get("acting")
+    if acting is None or acting["num_candidates"] == 1:
+        return "acting.num_candidates=1"
+    return " ".join(f"acting.{name}={value}" for name, value in acting.items())
 
 
 def _same_robot(one: dict[str, Any] | None, other: dict[str, Any] | None) -> bool:
