@@ -75,7 +75,7 @@ setup: $(VENV)/.complete ## install what tests and documentation need, too; ever
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing: install Python 3.11, or name it with make PYTHON=/path/to/python"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	@# Torch goes first: what depends on it would otherwise pick a version, and a build, of its own.
+# Torch goes first: what depends on it would otherwise pick a version, and a build, of its own.
 	$(INSTALL) torch
 	$(INSTALL) -e '.[play]'
 	@touch $@
