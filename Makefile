@@ -2,8 +2,8 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
-# Torch goes first: what depends on it would otherwise pick a version, and a build, of its own.
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Python compiles what it imports, once; to compile all that is installed takes much longer than to unpack it.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 # Programs of benchmarks/, in the order they run.
 BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job scaling_learner scaling_world
@@ -13,18 +13,18 @@ BENCHMARKS := deploy learner collection evaluation planners file_maps whole_job 
 WORKERS ?= logical
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: help setup train smoke play test test-slow chromium check format bench notebooks pictures tables docs clean
+.PHONY: help install setup train smoke play test test-slow chromium check format bench notebooks pictures tables docs clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F '|' '{ printf "%-16s %s\n", $$1, $$2 }'
 
-train: setup ## train a risk-conditioned agent: two cores, about 40 minutes
+train: install ## train a risk-conditioned agent: two cores, about 40 minutes
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
 
-smoke: setup ## rehearse the whole training in under a minute; it learns nothing
+smoke: install ## rehearse the whole training in under a minute; it learns nothing
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow preset=smoke
 
-play: setup ## drive a shipped agent on a page in your browser; Ctrl-C ends it
+play: install ## drive a shipped agent on a page in your browser; Ctrl-C ends it
 	$(BIN)/python -m rcdsac_trl.play
 
 test: setup chromium ## run the tests
@@ -68,12 +68,19 @@ format: setup ## let ruff repair what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-setup: $(VENV)/.complete ## make .venv with everything; every other target does it by itself
+install: $(VENV)/.installed ## make .venv with what trains and drives; train, smoke and play do it by themselves
 
-$(VENV)/.complete: pyproject.toml constraints.txt
+setup: $(VENV)/.complete ## install what tests and documentation need, too; every other target does it by itself
+
+$(VENV)/.installed: pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing: install Python 3.11, or name it with make PYTHON=/path/to/python"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
+# Torch goes first: what depends on it would otherwise pick a version, and a build, of its own.
 	$(INSTALL) torch
+	$(INSTALL) -e '.[play]'
+	@touch $@
+
+$(VENV)/.complete: $(VENV)/.installed
 	$(INSTALL) -e '.[dev]'
 	@touch $@
 

@@ -19,8 +19,9 @@ from torchrl.modules import GRUModule, TanhNormal
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
-from rcdsac_trl.agent.networks import LOG_STD_RANGE, Encoder, QuantileHead
+from rcdsac_trl.agent.networks import Encoder, QuantileHead
 from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.robot.action import LOG_STD_RANGE
 from rcdsac_trl.training.learner import Learner
 
 

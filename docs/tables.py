@@ -1,32 +1,43 @@
 """Write the tables of README.md and the pages of docs/ anew that follow from files: ``make tables``.
 
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
-``weights/``, and baselines of ``results/``, of which an evaluation is read; that of an accelerator is what
-``benchmarks/accelerator.py`` has written::
+``weights/``, and baselines of ``results/``, of which an evaluation is read. The comment of a table of the office course
+names the folder of what ``course`` wrote. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
 
     <!-- agents: sac-narrow pursuit-narrow -->
     | agent | collisions | ..
     <!-- agents: end -->
+    <!-- course: results/course -->
+    <!-- course: end -->
 """
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from rcdsac_trl.report.card import measured_values
+from rcdsac_trl.report.course_table import course_table
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 _TABLE = re.compile(r"(<!-- agents: (?!end)([^>]*?) -->\n).*?(<!-- agents: end -->)", re.S)
+_COURSE = re.compile(r"(<!-- course: (?!end)(\S+) -->\n).*?(<!-- course: end -->)", re.S)
 _ACCELERATOR = re.compile(r"(<!-- accelerator: begin -->\n).*?(<!-- accelerator: end -->)", re.S)
+_COURSE_HEADINGS = (
+    *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
+    *("in reverse: arrived", "collisions a run", "time, s"),
+)
 _HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goals")
 
 
 def renewed(text: str) -> str:
     """Return a document with its tables as the measured numbers have them."""
     text = _TABLE.sub(lambda found: found[1] + table_of(found[2].split()) + found[3], text)
+    text = _COURSE.sub(lambda found: found[1] + table_of_course(ROOT / found[2]) + found[3], text)
     measured = ROOT / "results" / "accelerator.json"
     values = json.loads(measured.read_text(encoding="utf-8")) if measured.is_file() else None
     return _ACCELERATOR.sub(lambda found: found[1] + accelerator_table(values) + found[2], text)
@@ -34,9 +45,33 @@ def renewed(text: str) -> str:
 
 def table_of(names: list[str]) -> str:
     """Return the table of some agents and baselines, Markdown: a row a condition."""
-    rows = [_cells(condition) for name in names for condition in measured_of(name)["conditions"]]
-    lines = [f"| {' | '.join(cells)} |\n" for cells in (_HEADINGS, *rows)]
-    return "".join([lines[0], f"|{'---|' * len(_HEADINGS)}\n", *lines[1:]])
+    return _markdown(_HEADINGS, [_cells(condition) for name in names for condition in measured_of(name)["conditions"]])
+
+
+def table_of_course(folder: Path) -> str:
+    """Return the table of the drives over the office course in a folder, Markdown, with the paper's in parentheses.
+
+    Args:
+        folder: of some ``runs.csv``, at any depth.
+    """
+    found = [pd.read_csv(path) for path in sorted(folder.rglob("runs.csv"))]
+    if not found:
+        return "Not driven yet.\n"
+    rows = []
+    for row in course_table(pd.concat(found)).to_dict("records"):
+        cells = [f"{row['agent']} {row['risk measure']}".strip(), row["β"]]
+        for direction in ("forward", "reverse"):
+            cells.append(row[f"{direction} finished"])
+            for number in ("collisions", "time, s"):
+                paper = row[f"{direction} {number}, paper"]
+                cells.append(f"{row[f'{direction} {number}']} ({paper})" if paper else row[f"{direction} {number}"])
+        rows.append(cells)
+    return _markdown(_COURSE_HEADINGS, rows)
+
+
+def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"| {' | '.join(cells)} |\n" for cells in (headings, *rows)]
+    return "".join([lines[0], f"|{'---|' * len(headings)}\n", *lines[1:]])
 
 
 def measured_of(name: str) -> Mapping[str, Any]:

@@ -113,6 +113,18 @@ def test_tables_of_agents_are_what_was_measured() -> None:
     assert measured.splitlines()[-1] == "| laptop | plain updates per second | 123.5 |"
 
 
+def test_the_table_of_the_course_is_what_was_driven(tmp_path: Path) -> None:
+    table = runpy.run_path(str(ROOT / "docs" / "tables.py"))["table_of_course"]
+    assert table(tmp_path) == "Not driven yet.\n"
+    columns = "run,agent,beta,direction,repetition,finished,time_s,collisions"
+    driven = ["forward,0,True,110.0,1", "forward,1,False,300.0,4", "reverse,0,True,97.0,0", "reverse,1,True,99.0,0"]
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "runs.csv").write_text("\n".join([columns, *(f"a,rcdsac_pow,-2,{run}" for run in driven)]))
+    # The paper's single runs: 0 collisions in 110 and 116 s.
+    cells = "RC-DSAC pow | -2 | 1 of 2 | 2.5 ± 1.5 (0) | 110 ± 0 (110) | 2 of 2 | 0.0 ± 0.0 (0) | 98 ± 1 (116)"
+    assert table(tmp_path).splitlines()[2] == f"| {cells} |"
+
+
 def commands() -> list[tuple[str, str]]:
     """Return verb and overrides of every command that names no folder of the reader's."""
     found = {text.split("#")[0].strip() for _, text in texts(rf"{COMMAND}(\w[^\n`]+)") if "<" not in text}

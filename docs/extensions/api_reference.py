@@ -29,6 +29,7 @@ _PAGES = {
             "rcdsac_trl.agent.risk",
             "rcdsac_trl.agent.network_settings",
             "rcdsac_trl.agent.networks",
+            "rcdsac_trl.agent.heads",
             "rcdsac_trl.agent.actor",
             "rcdsac_trl.agent.loss.loss_settings",
             "rcdsac_trl.agent.loss.distributional_sac",

@@ -112,7 +112,7 @@ def test_preset_paper_is_the_papers_table_of_hyper_parameters() -> None:
     assert settings.task.episode_steps == 1000
     assert settings.sensor.name == "narrow"
     # 5 M steps, all of which the replay holds, and 100,000 updates
-    assert settings.replay_steps == 500 * 10 * 1000
+    assert settings.replay_steps() == 500 * 10 * 1000
     assert all(schedule.distortion_strength(iteration) == 1.0 for iteration in range(500))
     assert all(schedule.learning_rate_share(iteration) == 1.0 for iteration in range(500))
     assert learner.actor_average_decay == 0.0
@@ -463,8 +463,9 @@ def test_conditions_of_an_evaluation() -> None:
 
 def test_replay_holds_an_iteration_and_is_no_larger_than_the_run_can_fill() -> None:
     settings = tiny_settings()
-    assert settings.replay_steps == 2 * 2 * 20 < settings.replay.capacity_steps
-    assert tiny_settings("sac", "replay.capacity_steps=40").replay_steps == 40
+    assert settings.replay_steps() == 2 * 2 * 20 < settings.replay.capacity_steps
+    assert tiny_settings("sac", "replay.capacity_steps=40").replay_steps(60) == 40
+    assert settings.replay_steps(60) == 2 * 2 * 20 + 60
     with pytest.raises(UserInputError, match=r"capacity_steps=39 does not hold the 40 steps of one iteration"):
         composed("+algo=sac", *TINY, "replay.capacity_steps=39")
 

@@ -84,6 +84,9 @@ def test_what_is_missing_is_named_with_the_nearest_or_the_way_to_it(own: Path) -
         find_weights("dsac_pow-narrow")
     with pytest.raises(UserInputError, match=r"^there is no agent 'quick': `.*agents` lists"):
         find_weights("quick")
+    written(own / "rcdsac_pow-narrow")  # of two that are as near the one that is there
+    with pytest.raises(UserInputError, match=r"^there is no agent 'rcdsac_pow': did you mean rcdsac_pow-narrow\?"):
+        find_weights("rcdsac_pow")
     with pytest.raises(UserInputError) as raised:
         find_weights("dsac_pow_-2-sparse")
     assert f"agent dsac_pow_-2-sparse is not here (looked into {own})" in str(raised.value)

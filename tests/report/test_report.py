@@ -526,7 +526,7 @@ def test_the_command_refuses_before_it_writes(
     with pytest.raises(SystemExit) as left:
         command.main()
     assert left.value.code == 2
-    assert "nowhere holds no evaluation.json" in capsys.readouterr().err
+    assert "there is no folder nowhere: name runs" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 from test_replay import EPISODE_STEPS, make_replay, numbered_episodes
 
-from rcdsac_trl.storage.replay_files import ReplayFiles, remove_others
+from rcdsac_trl.storage import replay_files
+from rcdsac_trl.storage.replay_files import ReplayFiles, inherit, remove_others
 from rcdsac_trl.storage.sequence_replay import SequenceReplay, bytes_per_slot
 
 SLOTS = EPISODE_STEPS + 1
@@ -79,3 +80,23 @@ def test_episodes_that_leave_before_they_are_saved_are_not_saved(tmp_path: Path)
         replay.stored_episodes(7, 3)
     with pytest.raises(ValueError, match="only an empty replay"):
         replay.restore(0, [])
+
+
+def test_another_run_begins_with_the_newest_episodes_in_files_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = make_replay(capacity_steps=7 * EPISODE_STEPS)
+    files = ReplayFiles(tmp_path / "ended", ended)
+    for _ in range(4):
+        add(ended, 3)
+        segments = files.save()
+    replay = make_replay(capacity_steps=5 * EPISODE_STEPS)
+    inherit(files.folder, segments, replay)
+    assert replay.episodes_added == 5
+    assert (replay.stored_episodes(0, 5) == ended.stored_episodes(7, 5)).all()
+    monkeypatch.setattr(replay_files, "_EPISODES_A_FILE", 2)
+    written = ReplayFiles(tmp_path / "new", replay).save()
+    assert [(segment.first_episode, segment.episodes) for segment in written] == [(0, 2), (2, 2), (4, 1)]
+    again = make_replay(capacity_steps=5 * EPISODE_STEPS)
+    ReplayFiles(tmp_path / "new", again).load(written)
+    assert (again.buffer.storage[:] == replay.buffer.storage[:]).all()

@@ -3,6 +3,8 @@
 import json
 import shutil
 import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,14 +14,15 @@ from torchrl.objectives import LossModule
 import tiny
 from rcdsac_trl import train
 from rcdsac_trl.config.compose import compose
-from rcdsac_trl.config.run_config import training_settings
+from rcdsac_trl.config.run_config import settings_of_run, training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import named_agent
+from rcdsac_trl.storage.checkpoint import load_states
 from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.setup import make_trainer, resume_training
-from rcdsac_trl.training.trainer import Trainer
+from rcdsac_trl.training.trainer import StopTraining, Trainer
 from tiny import TINY
 
 CRITICS, TARGETS = "critic_network_params.", "target_critic_network_params."
@@ -103,13 +106,61 @@ def test_what_is_no_agent_is_refused(overrides: list[str], told: str) -> None:
 def test_a_finished_run_goes_on_as_another_run(tiny_run: Path, tmp_path: Path) -> None:
     loss, average = named_agent(tiny_run, "last").load()
     trainer = begun(tiny_run, tmp_path / "run", "schedule.iterations=1")
-    assert_equal_states(trainer.learner.loss, loss)
-    assert_equal_states(trainer.learner.average, average)
-    assert not targets_are_critics(trainer.learner.loss)
-    assert trainer.progress.iterations == trainer.progress.updates == 0
-    assert not trainer.learner.optimizer.state
+    learner, progress = trainer.learner, trainer.progress
+    assert_equal_states(learner.loss, loss)
+    assert_equal_states(learner.average, average)
+    assert not targets_are_critics(learner.loss)
+    assert progress.iterations == progress.updates == 0
+    assert progress.skipped_maps == tiny.ITERATIONS  # it goes on with maps that the run has not had
+    assert {state["step"].item() for state in learner.optimizer.state.values()} == {tiny.UPDATES * tiny.ITERATIONS}
+    driven = tiny.AGENTS * tiny.ITERATIONS
+    assert learner.replay.episodes_added == driven
+    assert learner.replay.capacity_episodes == driven + tiny.AGENTS
+    told = f"go on from {tiny_run} after its 2 iterations, with 4 episodes in the replay; not copied: random streams, "
+    assert f"{told}schedule\n" in (tmp_path / "run" / "train.log").read_text()
+
+
+def test_a_run_that_goes_on_is_the_runs_in_every_key_and_is_continued_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MALLOC_MMAP_MAX_", "0")
+    ended = tmp_path / "ended"
+    tiny.tiny_trainer(ended, "rcdsac_cvar", "learner.kappa=0.4", "map.num_movers=3").run()
+    then = settings_of_run(ended)
+    cfg = compose("train", [f"init={ended}", "collector.num_processes=0", "threads=1", "logger=none"])
+    now = training_settings(cfg)
+    for name in ("algo", "map", "task", "world", "learner", "replay", "validation", "network"):
+        assert getattr(now, name) == getattr(then, name), name
+    assert now.schedule == replace(then.schedule, pursuit_iterations=0, neutral_iterations=0, ramp_iterations=0)
+    make_trainer(cfg, tmp_path / "whole").run()
+
+    def stop(trainer: Trainer, record: Mapping[str, float]) -> None:
+        raise StopTraining
+
+    make_trainer(cfg, tmp_path / "halves", on_iteration_end=stop).run()
+    shutil.rmtree(ended)
+    again = resume_training(tmp_path / "halves")
+    assert again is not None
+    # The replay is as large as before: four episodes of the ended run, four of this one.
+    assert again.learner.replay.capacity_episodes == 8
+    again.run()
+    whole, halves = (load_states(tmp_path / name / "checkpoints", "last")[1] for name in ("whole", "halves"))
+    assert whole["loss"].keys() == halves["loss"].keys()
+    assert all(torch.equal(value, halves["loss"][name]) for name, value in whole["loss"].items())
+
+
+def test_in_another_world_or_without_its_replay_a_run_begins_with_less(tiny_run: Path, tmp_path: Path) -> None:
+    elsewhere = begun(tiny_run, tmp_path / "elsewhere", "map.num_movers=1")
+    assert elsewhere.learner.replay.episodes_added == elsewhere.progress.skipped_maps == 0
+    assert not elsewhere.learner.optimizer.state
     told = f"begin with {tiny_run}; not copied: optimiser state, replay, random streams, schedule\n"
-    assert told in (tmp_path / "run" / "train.log").read_text()
+    assert told in (tmp_path / "elsewhere" / "train.log").read_text()
+    ended = shutil.copytree(tiny_run, tmp_path / "ended")
+    shutil.rmtree(ended / "replay")
+    without = begun(ended, tmp_path / "without")
+    assert without.learner.replay.episodes_added == 0
+    assert without.learner.optimizer.state
+    assert ".safetensors is missing), random streams, schedule\n" in (tmp_path / "without" / "train.log").read_text()
 
 
 def test_it_trains_and_is_continued_also_where_the_agent_is_gone(

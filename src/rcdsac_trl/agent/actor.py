@@ -12,14 +12,9 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from rcdsac_trl.agent.networks import (
-    ActorHead,
-    HistoryEncoder,
-    NetworkSettings,
-    QuantileHead,
-    ScalarHead,
-    encoder_class,
-)
+from rcdsac_trl.agent.heads import ActorHead, QuantileHead, ScalarHead
+from rcdsac_trl.agent.network_settings import NetworkSettings
+from rcdsac_trl.agent.networks import HistoryEncoder, encoder_class
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS

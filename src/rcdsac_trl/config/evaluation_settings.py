@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from rcdsac_trl.config.acting_override import ActingOverride
+from rcdsac_trl.config.baseline_name import own_class
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
@@ -142,6 +143,8 @@ class EvaluationSettings:
             raise UserInputError(
                 "name what to evaluate: either run=<folder or shipped agent> or baseline=<name>, such as mppi"
             )
+        if self.baseline is not None:
+            own_class(self.baseline)  # refuses what is no name
         if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
         if self.baseline is not None and (self.navigation.replan or self.navigation.watchdog):

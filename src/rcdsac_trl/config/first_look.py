@@ -22,6 +22,7 @@ from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.config.shipped_settings import VerificationSettings
 from rcdsac_trl.deploy import find_weights
 from rcdsac_trl.deploy.recordings.open_recording import open_recording
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.listening import check_can_listen
 from rcdsac_trl.system.resources import check_out, check_writable
 from rcdsac_trl.world.maps.map_source import check_maps
@@ -107,7 +108,7 @@ def look_at_verification(cfg: DictConfig) -> None:
 
 
 def look_at_play(cfg: DictConfig) -> None:
-    """Refuse settings and agents that `play` cannot take.
+    """Refuse settings, agents and maps that `play` cannot take.
 
     Raises:
         UserInputError: naming what is wrong.
@@ -116,6 +117,9 @@ def look_at_play(cfg: DictConfig) -> None:
     check_can_listen(settings.host, settings.port)
     for run in settings.runs:
         find_agent(run)
+    for path in settings.maps:
+        if not os.path.exists(path):
+            raise UserInputError(f"maps={path} does not exist: name a file that map=file takes")
     check_writable(Path(settings.films))
 
 

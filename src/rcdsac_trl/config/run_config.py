@@ -26,6 +26,8 @@ CONFIG_NAME = "config.yaml"
 """What makes a folder a run folder."""
 CHECKPOINTS = "checkpoints"
 """The folder of a run's checkpoints, in the run folder."""
+REPLAY = "replay"
+"""The folder of the episodes that a run learns from, in the run folder."""
 TRAINING_NAME = "training.yaml"
 """The config of an exported agent's training, in its folder."""
 

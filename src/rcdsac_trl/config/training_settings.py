@@ -191,8 +191,11 @@ class TrainingSettings:
         """Which of the 180 range bins the agent is told, bool [180]."""
         return self.robot.sensor_mask(self.sensor.name)
 
-    @property
-    def replay_steps(self) -> int:
-        """Steps that the replay is made for: no more than the run can fill."""
+    def replay_steps(self, inherited_steps: int = 0) -> int:
+        """Return the steps that the replay is made for: no more than the run can fill.
+
+        Args:
+            inherited_steps: those it begins with.
+        """
         steps = self.schedule.iterations * self.world.num_agents * self.task.episode_steps
-        return min(self.replay.capacity_steps, steps)
+        return min(self.replay.capacity_steps, inherited_steps + steps)

@@ -149,7 +149,7 @@ VERBS = {
         examples={
             "seed=7": "those of the wheel, on maps of your choosing: about 5 minutes on two cores",
             "rcdsac_pow-narrow num_maps=100": "one agent, more surely",
-            "sac-narrow seed=0 num_maps=50 num_episodes=10": "on the card's own maps",
+            "sac-narrow seed=0 num_maps=50 num_episodes=5": "on the card's own maps",
         },
     ),
     "publish": Verb(

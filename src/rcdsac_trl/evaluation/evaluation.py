@@ -8,6 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from rcdsac_trl.config.baseline_name import PURSUIT
 from rcdsac_trl.config.command_line import listed
 from rcdsac_trl.config.evaluation_settings import ChosenWorld, EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training
@@ -26,7 +27,7 @@ from rcdsac_trl.rollout.make_agent import packed, packed_loss
 from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
 from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS, table_of
 from rcdsac_trl.rollout.metrics import summarise
-from rcdsac_trl.rollout.planners.baselines import PURSUIT, check_baseline, settings_of
+from rcdsac_trl.rollout.planners.baselines import check_baseline, settings_of
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.progress import Watch

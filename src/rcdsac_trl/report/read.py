@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -89,10 +90,12 @@ def find_evaluations(folders: Sequence[Path]) -> list[Path]:
         folders: of evaluations, or of runs, whose ``evaluation/`` holds some.
 
     Raises:
-        UserInputError: for a folder without any.
+        UserInputError: for a folder that is not there, or has none.
     """
     found: list[Path] = []
     for folder in folders:
+        if not os.path.isdir(folder):  # false for a name that is too long, too
+            raise UserInputError(f"there is no folder {folder}: name runs, or evaluations of them")
         inside = [folder] if (folder / DESCRIPTION).is_file() else []
         inside += sorted(path.parent for path in folder.glob(f"evaluation/*/{DESCRIPTION}"))
         if not inside and (folder / BARN).is_file():

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from rcdsac_trl.config.baseline_name import PURSUIT
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import ControllerSettings
 from rcdsac_trl.config.navigation_settings import NavigationSettings
@@ -28,7 +29,7 @@ from rcdsac_trl.rollout.make_agent import make_actor, make_policy, unpacked_loss
 from rcdsac_trl.rollout.measurement import measure_map
 from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
 from rcdsac_trl.rollout.navigation_metrics import navigation_metrics
-from rcdsac_trl.rollout.planners.baselines import PURSUIT, baseline_policy
+from rcdsac_trl.rollout.planners.baselines import baseline_policy
 from rcdsac_trl.rollout.planners.controller import ControllerPolicy
 from rcdsac_trl.rollout.policies import AgentNoise
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor

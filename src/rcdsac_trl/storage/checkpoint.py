@@ -175,6 +175,15 @@ def load_average(path: Path, average: AveragedModel) -> Saved:
     return saved
 
 
+def load_optimizer(path: Path, optimizer: torch.optim.Optimizer) -> None:
+    """Load the optimiser's state of one checkpoint into an optimiser of the same networks.
+
+    Raises:
+        UserInputError: if the checkpoint is of another shape.
+    """
+    _load(Checkpoint(optimizer=optimizer), path)
+
+
 class _State:
     """Takes a component's state as it was saved."""
 

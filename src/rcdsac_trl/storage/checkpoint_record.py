@@ -38,7 +38,8 @@ class Progress:
         best_score: highest validation score so far; None before the first validation.
         best_iterations: iterations done when it was reached.
         restarts: how often worker processes died or hung.
-        skipped_maps: training maps that were given up for that; iteration i is on map i + skipped_maps.
+        skipped_maps: training maps that were given up for that, or that the run of ``init`` has had; iteration i is on
+            map i + skipped_maps.
         validating_iterations: iterations done by the agent whose validation is under way; None: there is none.
     """
 

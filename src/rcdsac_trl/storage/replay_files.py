@@ -11,6 +11,9 @@ from rcdsac_trl.storage import atomic
 from rcdsac_trl.storage.replay_segments import Segment
 from rcdsac_trl.storage.sequence_replay import SequenceReplay
 
+# What a file holds at most: writing one takes twice its size of memory. At the paper's schedule it is 100,000 steps.
+_EPISODES_A_FILE = 100
+
 
 class ReplayFiles:
     """Keeps the episodes of a replay in files, as compact as in memory (safetensors, nothing to unpickle).
@@ -34,9 +37,10 @@ class ReplayFiles:
         """
         oldest = self.replay.oldest_episode
         self._segments = [segment for segment in self._segments if segment.end > oldest]
-        first = max(oldest, self._segments[-1].end if self._segments else 0)
-        if first < self.replay.episodes_added:
-            self._segments.append(self._write(first, self.replay.episodes_added - first))
+        begin = max(oldest, self._segments[-1].end if self._segments else 0)
+        added = self.replay.episodes_added
+        for first in range(begin, added, _EPISODES_A_FILE):
+            self._segments.append(self._write(first, min(_EPISODES_A_FILE, added - first)))
         return list(self._segments)
 
     def _write(self, first: int, episodes: int) -> Segment:
@@ -51,14 +55,32 @@ class ReplayFiles:
         """Fill the empty replay with segments that :func:`~rcdsac_trl.storage.replay_segments.damage` found whole."""
         if not segments:
             return
-        oldest = max(segments[0].first_episode, segments[-1].end - self.replay.capacity_episodes)
-        self.replay.restore(oldest, self._read(segments, oldest))
+        oldest = _oldest(segments, self.replay)
+        self.replay.restore(oldest, _read(self.folder, segments, self.replay))
         self._segments = list(segments)
 
-    def _read(self, segments: Sequence[Segment], oldest: int) -> Iterator[TensorDict]:
-        for segment in segments:
-            tensors = safetensors.torch.load_file(self.folder / segment.file)
-            stored = TensorDict(tensors, batch_size=[segment.episodes, self.replay.episode_steps + 1])
+
+def inherit(folder: Path, segments: Sequence[Segment], replay: SequenceReplay) -> None:
+    """Fill an empty replay with the newest episodes of another run, as many as it holds; they are its first ones.
+
+    Args:
+        folder: of the other run's replay.
+        segments: that :func:`~rcdsac_trl.storage.replay_segments.damage` found whole.
+        replay: of the same sensor, observations and episodes.
+    """
+    replay.restore(0, _read(folder, segments, replay))
+
+
+def _oldest(segments: Sequence[Segment], replay: SequenceReplay) -> int:
+    return max(segments[0].first_episode, segments[-1].end - replay.capacity_episodes)
+
+
+def _read(folder: Path, segments: Sequence[Segment], replay: SequenceReplay) -> Iterator[TensorDict]:
+    oldest = _oldest(segments, replay)
+    for segment in segments:
+        if segment.end > oldest:
+            tensors = safetensors.torch.load_file(folder / segment.file)
+            stored = TensorDict(tensors, batch_size=[segment.episodes, replay.episode_steps + 1])
             yield stored[max(0, oldest - segment.first_episode) :]
 
 

@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.agent.kernels import matmul
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
 from rcdsac_trl.agent.transforms import Mirror
-from rcdsac_trl.config.run_config import CHECKPOINTS, settings_of_new_run, settings_of_run, with_map_digests
+from rcdsac_trl.config.run_config import CHECKPOINTS, REPLAY, settings_of_new_run, settings_of_run, with_map_digests
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.rollout.make_agent import make_average, make_loss, make_optimizer, make_relabel, packed, parameters
@@ -35,13 +35,12 @@ from rcdsac_trl.training.run_folder import check_folder, cut, has_begun, start_r
 from rcdsac_trl.training.run_log import RunLog
 from rcdsac_trl.training.trainer import IterationHook, Trainer, saved_sentence
 from rcdsac_trl.training.validation import Snapshot, SnapshotEvaluator, Validation
-from rcdsac_trl.training.warm_start import begin_with_agent
+from rcdsac_trl.training.warm_start import EndedRun, begin_with_agent, ended_run, go_on
 from rcdsac_trl.world.maps.map_source import check_maps
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 
 # Validation looks at the same maps whatever seed a run is trained with.
 VALIDATION_SEED = 0
-REPLAY = "replay"
 
 
 def run_folder() -> Path:
@@ -73,7 +72,7 @@ def check_machine(settings: TrainingSettings) -> None:
     """
     runtime.resolve_device(settings.device)
     _check_processes(settings)
-    _check_memory(settings)
+    _check_memory(settings, _inherited_steps(settings, ended_run(settings)))
 
 
 def _check_processes(settings: TrainingSettings) -> None:
@@ -85,10 +84,11 @@ def _check_processes(settings: TrainingSettings) -> None:
         check_may_start_processes()
 
 
-def _check_memory(settings: TrainingSettings) -> None:
+def _check_memory(settings: TrainingSettings, inherited_steps: int) -> None:
     """Refuse what surely does not fit; of a mini-batch its range observations alone are counted."""
     learner, others = settings.learner, "or end other programs"
-    resources.check_memory("the replay", _replay_bytes(settings), f"lower replay.capacity_steps, {others}")
+    replay = _replay_bytes(settings, settings.replay_steps(inherited_steps))
+    resources.check_memory("the replay", replay, f"lower replay.capacity_steps, {others}")
     observations = learner.batch_size * (learner.sequence_length + 1)
     batch_bytes = observations * settings.sensor_mask.size * torch.float32.itemsize
     resources.check_memory("a mini-batch", batch_bytes, f"lower learner.batch_size, {others}")
@@ -98,19 +98,30 @@ def _check_memory(settings: TrainingSettings) -> None:
     resources.check_memory(f"{simulations} simulations", needed_bytes, f"lower world.num_agents, {others}")
 
 
-def _replay_bytes(settings: TrainingSettings) -> int:
+def _inherited_steps(settings: TrainingSettings, ended: EndedRun | None) -> int:
+    """Return how many steps the replay of a new run begins with."""
+    return 0 if ended is None else ended.replay_episodes * settings.task.episode_steps
+
+
+def _inherited_steps_of(settings: TrainingSettings, saved: Saved) -> int:
+    """Return how many steps the replay of a run had begun with, from what it has added and driven since."""
+    added = saved.segments[-1].end * settings.task.episode_steps if saved.segments else 0
+    return added - saved.progress.steps
+
+
+def _replay_bytes(settings: TrainingSettings, steps: int) -> int:
     algo = settings.algo
     keys = (algo.context_key,) if algo.context_key is not None else ()
     bins = int(settings.sensor_mask.sum())
     vectors = vector_observations(settings.sensor.memory_s)
-    return replay_bytes(settings.replay_steps, settings.task.episode_steps, bins, keys, vectors)
+    return replay_bytes(steps, settings.task.episode_steps, bins, keys, vectors)
 
 
-def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
-    """Make the replay, no larger than the run can fill."""
+def make_replay(settings: TrainingSettings, device: str, inherited_steps: int = 0) -> SequenceReplay:
+    """Make the replay, empty and no larger than the run can fill beside the steps that it begins with."""
     algo = settings.algo
     return SequenceReplay(
-        capacity_steps=settings.replay_steps,
+        capacity_steps=settings.replay_steps(inherited_steps),
         episode_steps=settings.task.episode_steps,
         sequence_length=settings.learner.sequence_length,
         batch_size=settings.learner.batch_size,
@@ -122,12 +133,12 @@ def make_replay(settings: TrainingSettings, device: str) -> SequenceReplay:
     )
 
 
-def make_learner(settings: TrainingSettings, device: str) -> Learner:
+def make_learner(settings: TrainingSettings, device: str, inherited_steps: int = 0) -> Learner:
     """Make the networks and all that updates them, with an empty replay."""
     loss = make_loss(settings, device)
     sensed = torch.from_numpy(settings.sensor_mask)
     return Learner(
-        replay=make_replay(settings, device),
+        replay=make_replay(settings, device, inherited_steps),
         mirror=Mirror(sensed, device) if settings.learner.mirror else None,
         loss=loss,
         relabel=make_relabel(settings, device),
@@ -168,13 +179,12 @@ def make_trainer(
     }
     check_folder(folder)
     # Before anything is written: it may not fit into the memory, or not be that of `init`.
-    learner = _learner_here(settings)
-    messages = [] if settings.init is None else [begin_with_agent(learner, settings)]
+    learner, progress, messages = _begin(settings)
     folder.mkdir(parents=True, exist_ok=True)
     lock = FolderLock(folder)
     try:
         start_run_folder(folder, cfg, facts)
-        return _assemble(settings, learner, folder, lock, None, messages, on_iteration_end)
+        return _assemble(settings, learner, folder, lock, progress, messages, on_iteration_end)
     except BaseException:
         lock.close()
         raise
@@ -191,7 +201,6 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
     settings.collector.check_package()
     check_maps(settings.map, settings.task.min_path_m, settings.robot.circumradius_m)
     _check_processes(settings)
-    _check_memory(settings)
     lock = FolderLock(folder)
     try:
         saved, damaged = newest(folder / CHECKPOINTS, replay=folder / REPLAY) if has_begun(folder) else (None, [])
@@ -200,10 +209,14 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
                 rotate(folder / CHECKPOINTS, keep=settings.checkpoint.keep, replay=folder / REPLAY)
             lock.close()
             return None
-        learner, messages = _learner_here(settings), list(damaged)
-        if saved is None and settings.init is not None:
-            messages.append(begin_with_agent(learner, settings))
-        return _assemble(settings, learner, folder, lock, saved, messages, on_iteration_end)
+        if saved is None:
+            _check_memory(settings, _inherited_steps(settings, ended_run(settings)))
+            learner, progress, messages = _begin(settings)
+            return _assemble(settings, learner, folder, lock, progress, messages, on_iteration_end)
+        inherited_steps = _inherited_steps_of(settings, saved)
+        _check_memory(settings, inherited_steps)
+        learner = _learner_here(settings, inherited_steps)
+        return _assemble(settings, learner, folder, lock, saved, damaged, on_iteration_end)
     except BaseException:
         lock.close()
         raise
@@ -221,10 +234,21 @@ def reproduce_failure(dump: Path) -> tuple[LossModule, TensorDict]:
     return loss, load_failure(dump, loss)
 
 
-def _learner_here(settings: TrainingSettings) -> Learner:
+def _learner_here(settings: TrainingSettings, inherited_steps: int) -> Learner:
     """Make the learner with the threads and on the device that this machine gives the run."""
     runtime.set_threads(settings.threads)
-    return make_learner(settings, runtime.resolve_device(settings.device))
+    return make_learner(settings, runtime.resolve_device(settings.device), inherited_steps)
+
+
+def _begin(settings: TrainingSettings) -> tuple[Learner, Progress, list[str]]:
+    """Make the learner of a new run, where that begins, and say what `init` gave it."""
+    ended = ended_run(settings)
+    learner = _learner_here(settings, _inherited_steps(settings, ended))
+    if settings.init is None:
+        return learner, Progress(), []
+    if ended is None:
+        return learner, Progress(), [begin_with_agent(learner, settings)]
+    return learner, Progress(skipped_maps=ended.maps), [go_on(learner, settings, ended)]
 
 
 def _assemble(
@@ -232,10 +256,11 @@ def _assemble(
     learner: Learner,
     folder: Path,
     lock: FolderLock,
-    saved: Saved | None,
+    begin: Progress | Saved,
     messages: list[str],
     on_iteration_end: IterationHook | None,
 ) -> Trainer:
+    """Put the run together; it goes on from what is saved, or begins with a progress of no iterations."""
     device, threads = runtime.resolve_device(settings.device), runtime.resolve_threads(settings.threads)
     loss, average, optimizer, relabel = learner.loss, learner.average, learner.optimizer, learner.relabel
     generators = {"replay": learner.replay.generator}
@@ -247,24 +272,27 @@ def _assemble(
         replay=ReplayFiles(folder / REPLAY, learner.replay),
         keep=settings.checkpoint.keep,
     )
+    replay_size = _replay_bytes(settings, learner.replay.capacity_episodes * settings.task.episode_steps)
     written = sum(path.stat().st_size for path in (folder / REPLAY).glob("*"))
     # Those that stay, the best, the one being validated, the one being written; a checkpoint doubles when the optimiser
     # has its state.
     checkpoints_bytes = 2 * checkpoints.size_bytes() * (settings.checkpoint.keep + 3)
-    shortage = resources.disk_shortage(folder, max(0, _replay_bytes(settings) - written) + checkpoints_bytes)
+    shortage = resources.disk_shortage(folder, max(0, replay_size - written) + checkpoints_bytes)
     messages = [*messages, *([] if shortage is None else [shortage])]
-    progress, pending = Progress(), None
-    if saved is not None:
-        progress, more = _restore(folder, checkpoints, saved)
+    pending = None
+    if isinstance(begin, Progress):
+        progress = begin
+    else:
+        progress, more = _restore(folder, checkpoints, begin)
         pending, progress, left_out = _pending(settings, checkpoints.folder, progress)
         total = settings.schedule.iterations
         messages = [
             *messages,
             *more,
             *left_out,
-            f"continue after {progress.iterations} of {total} iterations, from {saved.path}",
+            f"continue after {progress.iterations} of {total} iterations, from {begin.path}",
         ]
-    log = RunLog(folder, settings.logger.backends, continued_at=progress.steps if saved is not None else None)
+    log = RunLog(folder, settings.logger.backends, continued_at=None if isinstance(begin, Progress) else progress.steps)
     active = f"allocator: {runtime.allocator()}, matrix products by {matmul.LIBRARY} BLAS"
     for sentence in [*messages, f"device {device}, {threads} threads, {active}"]:
         log.message(sentence)

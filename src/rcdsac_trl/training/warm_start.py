@@ -1,15 +1,86 @@
 """A training that begins with an agent that is there: what it takes over, and what it begins anew."""
 
+from dataclasses import dataclass
+from pathlib import Path
+
 from torch import Tensor
 
 from rcdsac_trl.config.named_folder import find_agent
+from rcdsac_trl.config.run_config import CHECKPOINTS, REPLAY
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import NamedAgent, named_agent
 from rcdsac_trl.release.run_weights import TEMPERATURE
+from rcdsac_trl.storage import replay_files, replay_segments
+from rcdsac_trl.storage.checkpoint import load_optimizer
+from rcdsac_trl.storage.checkpoint_record import Saved, find
 from rcdsac_trl.training.learner import Learner
 
 _CRITICS, _TARGETS = "critic_network_params.", "target_critic_network_params."
+# What makes the episodes of one run worth as much to another.
+_WORLD = ("algo", "sensor", "robot", "task", "map")
+
+
+@dataclass(frozen=True)
+class EndedRun:
+    """A run that goes on as another one, in its own world.
+
+    Attributes:
+        folder: of the run.
+        saved: its last checkpoint.
+    """
+
+    folder: Path
+    saved: Saved
+
+    @property
+    def replay_episodes(self) -> int:
+        """Episodes in the files of its replay."""
+        return sum(segment.episodes for segment in self.saved.segments)
+
+    @property
+    def maps(self) -> int:
+        """Maps it has had; the next one is new."""
+        return self.saved.progress.iterations + self.saved.progress.skipped_maps
+
+
+def ended_run(settings: TrainingSettings) -> EndedRun | None:
+    """Return the run that a new one goes on from: that of ``init``, if row, sensor, robot, task and maps are its own.
+
+    Raises:
+        UserInputError: if there is no such agent, or the run has no checkpoint that is whole.
+    """
+    if settings.init is None:
+        return None
+    found = find_agent(settings.init)
+    if not found.is_run:
+        return None
+    then = found.settings()
+    if any(getattr(then, name) != getattr(settings, name) for name in _WORLD):
+        return None
+    return EndedRun(found.path, find(found.path / CHECKPOINTS, "last")[0])
+
+
+def go_on(learner: Learner, settings: TrainingSettings, ended: EndedRun) -> str:
+    """Give a learner all that a run has learnt and learns from, and say in a sentence what it was not given.
+
+    Networks and temperature as :func:`begin_with_agent`, the optimiser's state, and the newest episodes of the replay,
+    as many as the learner's holds.
+
+    Raises:
+        UserInputError: if the run's networks are others.
+    """
+    begin_with_agent(learner, settings)
+    load_optimizer(ended.saved.path, learner.optimizer)
+    left = ["random streams", "schedule"]
+    if (damage := replay_segments.damage(ended.folder / REPLAY, ended.saved.segments)) is not None:
+        left.insert(0, f"replay ({damage})")
+    elif ended.saved.segments:
+        replay_files.inherit(ended.folder / REPLAY, ended.saved.segments, learner.replay)
+    return (
+        f"go on from {settings.init} after its {ended.saved.progress.iterations} iterations, with "
+        f"{learner.replay.episodes_added} episodes in the replay; not copied: {', '.join(left)}"
+    )
 
 
 def begin_with_agent(learner: Learner, settings: TrainingSettings) -> str:

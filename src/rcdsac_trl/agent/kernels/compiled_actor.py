@@ -8,6 +8,7 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
+from rcdsac_trl.agent.heads import ActorHead
 from rcdsac_trl.agent.kernels.compiled_encoder import (
     EncoderWeights,
     Floats,
@@ -18,7 +19,8 @@ from rcdsac_trl.agent.kernels.compiled_encoder import (
     encoder_weights,
     layer,
 )
-from rcdsac_trl.agent.networks import LOG_STD_RANGE, ActorHead, Encoder
+from rcdsac_trl.agent.networks import Encoder
+from rcdsac_trl.robot.action import LOG_STD_RANGE
 from rcdsac_trl.system.jit import njit
 
 _LOG_STD_LOW, _LOG_STD_HIGH = (np.float32(limit) for limit in LOG_STD_RANGE)

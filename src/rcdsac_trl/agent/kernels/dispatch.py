@@ -12,21 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rcdsac_trl.agent.heads import ActorHead, CosineFeatures, LookAhead, QuantileHead, with_look_ahead
 from rcdsac_trl.agent.kernels.compiled_encoder import CompiledEncoder
 from rcdsac_trl.agent.kernels.observation_features import observation_features
 from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
 from rcdsac_trl.agent.kernels.recurrent_kernels import gated_recurrence
-from rcdsac_trl.agent.networks import (
-    ActorHead,
-    CosineFeatures,
-    Encoder,
-    HistoryEncoder,
-    LookAhead,
-    QuantileHead,
-    RangeFeatures,
-    in_turn,
-    with_look_ahead,
-)
+from rcdsac_trl.agent.networks import Encoder, HistoryEncoder, RangeFeatures, in_turn
 from rcdsac_trl.robot.ring import KERNELS
 
 #: Below this number, one call of a layer costs more than what it computes.

@@ -7,7 +7,9 @@ import torch
 from torch import Tensor, nn
 
 from rcdsac_trl.agent.actor import network_of_heads
-from rcdsac_trl.agent.networks import ActorHead, Encoder, HistoryEncoder, NetworkSettings, QuantileHead, ScalarHead
+from rcdsac_trl.agent.heads import ActorHead, QuantileHead, ScalarHead
+from rcdsac_trl.agent.network_settings import NetworkSettings
+from rcdsac_trl.agent.networks import Encoder, HistoryEncoder
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.weights import Weights

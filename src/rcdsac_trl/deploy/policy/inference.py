@@ -165,7 +165,7 @@ class Encoders:
 
 
 class Actor:
-    """What its encoder hands on to an action; see ``rcdsac_trl.agent.networks.ActorHead``."""
+    """What its encoder hands on to an action; see ``rcdsac_trl.agent.heads.ActorHead``."""
 
     def __init__(self, weights: Weights) -> None:
         parts = [weights.part("actor.head")]

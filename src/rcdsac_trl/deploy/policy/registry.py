@@ -136,6 +136,9 @@ def find_weights(name_or_folder: str | Path) -> Path:
             f"agent {name} is not here (looked into {looked}): let {WEIGHTS_VARIABLE} name the folder weights/ of a "
             f"checkout that has it, or train it, {rebuilding_command(name)}"
         )
-    near = difflib.get_close_matches(name, sorted({*agents, *table_names()}), n=1)
+    near = [  # one that is here before one that would have to be trained
+        *difflib.get_close_matches(name, sorted(agents), n=1),
+        *difflib.get_close_matches(name, sorted(table_names()), n=1),
+    ]
     meant = f"did you mean {near[0]}? " if near else ""
     raise UserInputError(f"there is no agent {name!r}: {meant}{others}")

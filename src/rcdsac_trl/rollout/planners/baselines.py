@@ -1,7 +1,6 @@
 """Baselines by name: what ``baseline=`` of an evaluation may be."""
 
 import importlib
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -11,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
+from rcdsac_trl.config.baseline_name import PURSUIT, OwnClass, own_class
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import waypoint_observation
 from rcdsac_trl.robot.range_sensor import NUM_BINS
@@ -20,13 +20,11 @@ from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
 from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
 from rcdsac_trl.rollout.policies import PursuitPolicy
 
-PURSUIT = "pursuit"
 _PLANNERS: Mapping[str, Callable[[RobotSettings], Controller]] = {
     "dwa": lambda robot: Dwa(robot=robot),
     "mppi": lambda robot: Mppi(robot=robot),
 }
 _SETTINGS: Mapping[str, Callable[[], Any]] = {"dwa": DwaSettings, "mppi": MppiSettings}
-_OWN = re.compile(r"(?P<module>\w+(\.\w+)*):(?P<name>\w+)")
 
 
 def baseline_policy(
@@ -47,7 +45,8 @@ def baseline_policy(
     """
     if name == PURSUIT:
         return PursuitPolicy(robot)
-    make = partial(_PLANNERS[name], robot) if name in _PLANNERS else _own_class(name)
+    own = own_class(name)
+    make = partial(_PLANNERS[name], robot) if own is None else _imported(name, own)
     return ControllerPolicy(make, name, robot.sensor_mask(sensor), agent_ids, seed, robot)
 
 
@@ -58,7 +57,7 @@ def check_baseline(name: str, sensor: str, robot: RobotSettings = PAPER) -> None
         UserInputError: if there is no such baseline, it cannot be made, or it answers no two velocities.
     """
     policy = baseline_policy(name, sensor=sensor, agent_ids=[0], seed=0, robot=robot)
-    if name == PURSUIT or name in _PLANNERS:
+    if own_class(name) is None:
         return
     ahead = waypoint_observation((0.0, 0.0, 0.0), (5.0, 0.0), (5.0, 0.0))
     seen = {
@@ -80,24 +79,19 @@ def settings_of(name: str) -> dict[str, Any]:
     return {"baseline": asdict(_SETTINGS[name]())} if name in _SETTINGS else {}
 
 
-def _own_class(name: str) -> Callable[[], Controller]:
+def _imported(name: str, own: OwnClass) -> Callable[[], Controller]:
     """Return what makes a user's controller, after it has made one."""
-    match = _OWN.fullmatch(name)
-    if match is None:
-        raise UserInputError(
-            f"baseline={name} is unknown: choose one of {', '.join([PURSUIT, *_PLANNERS])}, or <module>:<class>"
-        )
     try:
-        module = importlib.import_module(match["module"])
+        module = importlib.import_module(own.module)
     except Exception as error:
-        raise _failed(name, f"import {match['module']}", error) from error
-    make: Any = getattr(module, match["name"], None)
+        raise _failed(name, f"import {own.module}", error) from error
+    make: Any = getattr(module, own.name, None)
     if make is None:
-        raise UserInputError(f"baseline={name}: module {match['module']} has no {match['name']}")
+        raise UserInputError(f"baseline={name}: module {own.module} has no {own.name}")
     try:
         made = make()
     except Exception as error:
-        raise _failed(name, f"call {match['name']}() without arguments", error) from error
+        raise _failed(name, f"call {own.name}() without arguments", error) from error
     lacking = [method for method in ("reset", "act") if not callable(getattr(made, method, None))]
     if lacking:
         raise UserInputError(
