@@ -137,7 +137,10 @@ def test_weights_carry_how_they_act_and_those_of_before_act_by_the_mean(tmp_path
     assert Policy(read_weights(tmp_path)).acting == MANY
     assert "| acts by | the best of 32 actions" in (tmp_path / "README.md").read_text()
     config = json.loads((tmp_path / "config.json").read_bytes())
-    assert config.pop("acting") == {"num_candidates": 32, "spread": 2.0, "over_critics": "minimum"}
+    assert config.pop("acting") == {"num_candidates": 32, "spread": 2.0, "over_critics": "minimum", "margin_m": 0.0}
+    # Those of before there was a margin do not say any.
+    (tmp_path / "config.json").write_text(json.dumps(config | {"acting": {"num_candidates": 32, "spread": 2.0}}))
+    assert Policy(read_weights(tmp_path)).acting == MANY
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 4}))
     assert Policy(read_weights(tmp_path)).acting == BY_MEAN
 
@@ -151,6 +154,8 @@ def test_weights_carry_how_they_act_and_those_of_before_act_by_the_mean(tmp_path
         ({"spread": 0.0}, "acting.spread=0 must be above 0 and at most 10"),
         ({"spread": float("nan")}, "acting.spread=nan must be above 0 and at most 10"),
         ({"spread": "wide"}, "acting.spread='wide' is no number"),
+        ({"margin_m": -0.01}, r"acting.margin_m=-0.01 is outside \[0, 0.2\]: give metres"),
+        ({"margin_m": 5}, r"acting.margin_m=5 is outside \[0, 0.2\]: give metres"),
         ({"over_critics": "median"}, "acting.over_critics=median is unknown: choose one of minimum, mean"),
     ],
 )
@@ -160,6 +165,17 @@ def test_what_nobody_can_act_by_is_refused(values: dict[str, Any], told: str) ->
             make(**values)
     with pytest.raises(UserInputError, match=told):
         agent(acting=values)
+
+
+def test_a_margin_needs_heads_that_look_ahead() -> None:
+    careful = replace(MANY, margin_m=0.03)
+    with pytest.raises(UserInputError, match=r"acting.margin_m=0.03 needs an agent with network.look_ahead=true"):
+        agent(acting=careful)
+    with pytest.raises(UserInputError, match=r"acting.margin_m=0.03 needs an agent with network.look_ahead=true"):
+        Policy(agent(), acting=careful)
+    assert Policy(agent(), acting=replace(careful, num_candidates=1)).acting.margin_m == 0.03  # not read
+    assert "told that all is 3 cm nearer" in str(careful)
+    assert "nearer" not in str(MANY)
 
 
 def test_a_measure_that_numpy_does_not_know_cannot_choose() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rcdsac_trl.robot.foreseen_clearance import MIRRORED_COMMANDS, ForeseenClearance
-from rcdsac_trl.robot.look_ahead import FORESEEN_ACTIONS, FORESEEN_SIZE, look_ahead
+from rcdsac_trl.robot.look_ahead import FORESEEN_ACTIONS, FORESEEN_SIZE, look_ahead, nearer
 
 ACTIONS = np.array([(speed, turn) for speed, turns in FORESEEN_ACTIONS for turn in turns], np.float32)
 FORESEEN = np.random.default_rng(0).uniform(0.0, 1.6, FORESEEN_SIZE).astype(np.float32)
@@ -46,3 +46,22 @@ def test_turning_away_from_a_thing_leads_less_near() -> None:
     turns = [look_ahead(foreseen, np.array([0.8, turn], np.float32))[1] for turn in (-0.9, -0.5, -0.1)]
     assert turns == sorted(turns)
     assert turns[0] < turns[-1]
+
+
+def test_nearer_by_a_margin_is_what_is_foreseen_of_things_that_much_nearer() -> None:
+    """A wall across the way, and the same wall 5 cm nearer; what is too far to count, and the memory, stay."""
+    rows = [
+        ForeseenClearance().nearness(np.array([[x, 0.0]]), np.empty((0, 6)), np.zeros(3), 0.0, 0.0)
+        for x in (0.99, 0.94)
+    ]
+    still = 17  # standing, so that the gap is the wall's distance less 0.2 m
+    told = nearer(np.concatenate((np.full((3, 7), 0.3, np.float32), np.tile(rows[0], (3, 1))), axis=1), 0.05)
+    assert told.shape == (3, 7 + FORESEEN_SIZE)
+    assert told.dtype == np.float32
+    assert (told[:, :7] == np.float32(0.3)).all()
+    np.testing.assert_allclose(told[:, 7 + still], rows[1][still], atol=1e-6)
+    assert (told[1, 7:][rows[0] == 0.0] == 0.0).all()
+    assert (rows[0] == 0.0).any()
+    # 1 cm less than the least gap that counts is no nearer than that.
+    least = np.full(FORESEEN_SIZE, np.log10(0.8 / 0.06), np.float32)
+    np.testing.assert_allclose(nearer(least, 0.05), np.log10(0.8 / 0.02), atol=1e-6)

@@ -1,6 +1,7 @@
 """Critics choose among actions around the mean: in a simulation and on a robot alike, by the measure of their beta."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,20 +63,22 @@ class BesideRobots(TensorDictModuleBase):
 
 
 @pytest.mark.parametrize(
-    ("row", "more"),
+    ("row", "more", "acting"),
     [
-        ("rcdsac_cvar", REMEMBERS),
-        ("dsac_pow", ["learner.num_critics=1"]),
-        ("rcwr", []),
-        ("sac", REMEMBERS),
+        ("rcdsac_cvar", REMEMBERS, replace(ACTING, margin_m=0.05)),
+        ("dsac_pow", ["learner.num_critics=1"], ACTING),
+        ("rcwr", [], ACTING),
+        ("sac", REMEMBERS, ACTING),
     ],
 )
-def test_a_robot_chooses_as_the_simulation_does(tmp_path: Path, row: str, more: list[str]) -> None:
+def test_a_robot_chooses_as_the_simulation_does(
+    tmp_path: Path, row: str, more: list[str], acting: ActingSettings
+) -> None:
     run, loss, average = untrained_run(tmp_path / "run", row, *more)
     settings, ids = tiny_settings(row, *more), range(AGENTS)
     policy = make_policy(average.module, AgentNoise(ids), "cpu")
-    robots = [Policy(weights_of_run(run, "last"), acting=ACTING) for _ in ids]
-    beside = BesideRobots(choosing(policy, loss.critics, settings, AGENTS), robots, settings.algo.context_key)
+    robots = [Policy(weights_of_run(run, "last"), acting=acting) for _ in ids]
+    beside = BesideRobots(choosing(policy, loss.critics, settings, AGENTS, acting), robots, settings.algo.context_key)
     worker = rollout_worker(
         settings.training_world,
         settings.algo,

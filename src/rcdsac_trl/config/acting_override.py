@@ -14,6 +14,7 @@ class ActingOverride:
         num_candidates: as in :class:`~rcdsac_trl.deploy.policy.acting.ActingSettings`.
         spread: likewise.
         over_critics: likewise.
+        margin_m: likewise.
 
     Raises:
         UserInputError: for what no agent can do.
@@ -22,6 +23,7 @@ class ActingOverride:
     num_candidates: int | None = None
     spread: float | None = None
     over_critics: OverCritics | None = None
+    margin_m: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse what lies outside the limits."""
@@ -38,7 +40,7 @@ class ActingOverride:
 
         Example:
             >>> ActingOverride(num_candidates=32).of(ActingSettings(spread=0.5))
-            ActingSettings(num_candidates=32, spread=0.5, over_critics='minimum')
+            ActingSettings(num_candidates=32, spread=0.5, over_critics='minimum', margin_m=0.0)
         """
         return replace(own, **self.given)  # type: ignore[arg-type]
 

@@ -191,11 +191,12 @@ class EvaluationSettings:
         """Return how the agents act: as their run's config says, with what was chosen in its place.
 
         Raises:
-            UserInputError: if actions are to be drawn and chosen.
+            UserInputError: if actions are to be drawn and chosen, or the agent's heads read no margin.
         """
         if self.run is None:
             return BY_MEAN
         acting = self.acting.of(trained.acting)
+        acting.check_heads(trained.network.look_ahead)
         if self.sampled and acting.chooses:
             raise UserInputError(
                 f"sampled=true draws actions, and acting.num_candidates={acting.num_candidates} chooses among some: "

@@ -165,6 +165,7 @@ class TrainingSettings:
                 "network.look_ahead=true reads what is remembered: set sensor.memory_s above 0, or "
                 "network.look_ahead=false"
             )
+        self.acting.check_heads(self.network.look_ahead)
         iteration_steps = self.training_world.num_agents * episode_steps
         if self.replay.capacity_steps < iteration_steps:
             raise UserInputError(

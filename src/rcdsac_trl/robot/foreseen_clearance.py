@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.action import desired_velocities
-from rcdsac_trl.robot.look_ahead import FORESEEN_ACTIONS
+from rcdsac_trl.robot.look_ahead import FORESEEN_ACTIONS, FORESEEN_SPAN_M
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
 
@@ -27,9 +27,6 @@ MIRRORED_COMMANDS: NDArray[np.intp] = np.array(
 _PERIOD_S = 0.14
 # Steps of the horizons: 0.42 and 1.4 s.
 _SOON, _LATER = 3, 10
-# What is this much farther from the way than the robot's inside is not near.
-_FAR_M = 0.8
-_LEAST_GAP_M = 0.02
 
 
 class ForeseenClearance:
@@ -83,7 +80,7 @@ class ForeseenClearance:
         """
         told = np.zeros(2 * len(self.commands), np.float32)
         radii_m = self._inner_radius_m, self._reach_m
-        _foresee(told, self.commands, self._changes, radii_m, points, moving, pose, v, omega)
+        _foresee(told, self.commands, self._changes, radii_m, FORESEEN_SPAN_M, points, moving, pose, v, omega)
         return told
 
 
@@ -95,6 +92,7 @@ def _foresee(
     commands: np.ndarray,
     changes: tuple[float, float],
     radii_m: tuple[float, float],
+    span_m: tuple[float, float],
     points: np.ndarray,
     moving: np.ndarray,
     pose: np.ndarray,
@@ -103,7 +101,8 @@ def _foresee(
 ) -> None:
     """Write what :meth:`ForeseenClearance.nearness` returns."""
     inner_radius_m, reach_m = radii_m
-    far_m = inner_radius_m + _FAR_M
+    least_gap_m, far_gap_m = span_m
+    far_m = inner_radius_m + far_gap_m
     near = np.empty((len(points), 2))
     number = 0
     for row in range(len(points)):
@@ -133,7 +132,7 @@ def _foresee(
                 least_m = min(least_m, math.hypot(dx, dy) - mover[4])
             if step in (_SOON, _LATER):
                 gap_m = min(least_m, math.sqrt(least_m2)) - inner_radius_m
-                told[command + len(commands) * (step // _LATER)] = math.log10(_FAR_M / max(gap_m, _LEAST_GAP_M))
+                told[command + len(commands) * (step // _LATER)] = math.log10(far_gap_m / max(gap_m, least_gap_m))
 
 
 @njit

@@ -22,6 +22,10 @@ FORESEEN_ACTIONS: tuple[tuple[float, tuple[float, ...]], ...] = (
 """Rows of actions, each its first number and the second ones from right to left. Of the paper's robot the rows are
 full speed, half of it, standing, and backwards."""
 
+FORESEEN_SPAN_M = (0.02, 0.8)
+"""Gaps between the robot's inside and what it foresees, m: below the first all are alike, beyond the second none is near.
+"""
+
 NUM_LOOK_AHEAD = 2
 """Numbers that are told of an action: how near it leads soon, and later."""
 
@@ -70,6 +74,25 @@ def _hats() -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     # [action, axis, side, slope or offset] to [slope or offset, side, axis, action]
     slopes, offsets = np.array(lines, np.float32).transpose(3, 2, 1, 0)
     return np.ascontiguousarray(slopes), np.ascontiguousarray(offsets)
+
+
+def nearer(read: NDArray[np.float32], margin_m: float) -> NDArray[np.float32]:
+    """Return what heads read if all that is foreseen were nearer by a margin, but for what is too far to count.
+
+    Args:
+        read: what heads read, what is foreseen last, float32 [.., n >= 44].
+        margin_m: the margin, m.
+
+    Example:
+        >>> read = np.full(44, np.log10(0.8 / 0.1), np.float32)  # 0.1 m from the circle inside the robot
+        >>> [round(float(0.8 / 10.0**told), 3) for told in nearer(read, 0.03)[:2]]
+        [0.07, 0.07]
+    """
+    told = read[..., -FORESEEN_SIZE:]
+    least_m, far_m = np.float32(FORESEEN_SPAN_M)
+    gap_m = far_m * np.power(np.float32(10.0), -told) - np.float32(margin_m)
+    moved = np.log10(far_m / np.maximum(gap_m, least_m))
+    return np.concatenate((read[..., :-FORESEEN_SIZE], np.where(told > 0.0, moved, told)), axis=-1, dtype=np.float32)
 
 
 HAT_SLOPES, HAT_OFFSETS = _hats()

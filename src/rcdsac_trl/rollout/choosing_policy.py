@@ -12,6 +12,7 @@ from rcdsac_trl.agent.loss.distributional_sac import OVER_CRITICS
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.deploy.policy.acting import NUM_FRACTIONS, ActingSettings
 from rcdsac_trl.deploy.policy.distortion import fractions_of
+from rcdsac_trl.robot.look_ahead import nearer
 
 
 class ChoosingPolicy(TensorDictModuleBase):
@@ -50,6 +51,7 @@ class ChoosingPolicy(TensorDictModuleBase):
         self._critics = critics
         self._steps = [dispatch.one_by_one(critic[0].module) for critic in critics]
         self._noise = torch.from_numpy(settings.noise())
+        self._margin_m = settings.margin_m
         self._over = OVER_CRITICS[settings.over_critics]
         self._tau = torch.from_numpy(fractions_of(NUM_FRACTIONS)).view(1, 1, -1)
         self._beta = self._tau.new_full((num_agents, 1), beta or 0.0)
@@ -76,8 +78,12 @@ class ChoosingPolicy(TensorDictModuleBase):
         for number, (encoder, _) in enumerate(self._critics):
             seen = [tensordict[key] for key in (*encoder.in_keys, "is_init")]
             memory, self._states[number] = self._steps[number](*seen, self._states[number])
-            memories.append(memory)
+            memories.append(self._with_margin(memory))
         return memories
+
+    def _with_margin(self, memory: Tensor) -> Tensor:
+        """Return what heads read if all that is foreseen were nearer by the margin."""
+        return memory if self._margin_m == 0.0 else torch.from_numpy(nearer(memory.numpy(), self._margin_m))
 
     def _values(self, memories: Sequence[Tensor], candidates: Tensor, beta: Tensor) -> Tensor:
         """Return what the critics together say of an agent's candidates ``[K, 2]``, ``[K]``."""

@@ -17,6 +17,7 @@ NUM_FRACTIONS = 8
 
 _MOST_CANDIDATES = 4096
 _WIDEST = 10.0
+_WIDEST_MARGIN_M = 0.2
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -28,6 +29,8 @@ class ActingSettings:
         num_candidates: actions that the critics choose among, tanh(mean) one of them; 1: tanh(mean) itself.
         spread: how far from the mean the others lie, in standard deviations of the policy.
         over_critics: what counts of what the critics say of one: the smallest value, or the mean.
+        margin_m: while they choose, they are told that all that is foreseen is so much nearer, m; needs heads that look
+            ahead.
 
     Raises:
         UserInputError: if a value is outside its limits.
@@ -36,10 +39,11 @@ class ActingSettings:
     num_candidates: int = 1
     spread: float = 1.0
     over_critics: OverCritics = "minimum"
+    margin_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what lies outside the limits; files bring plain values."""
-        for name, kinds in (("num_candidates", (int,)), ("spread", (int, float))):
+        for name, kinds in (("num_candidates", (int,)), ("spread", (int, float)), ("margin_m", (int, float))):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, kinds):
                 raise UserInputError(f"acting.{name}={value!r} is no {'whole ' if kinds == (int,) else ''}number")
@@ -51,6 +55,10 @@ class ActingSettings:
                 f"acting.spread={self.spread:g} must be above 0 and at most {_WIDEST:g} standard deviations"
             )
         one_of("acting.over_critics", self.over_critics, OverCritics)
+        if not 0.0 <= self.margin_m <= _WIDEST_MARGIN_M:
+            raise UserInputError(
+                f"acting.margin_m={self.margin_m:g} is outside [0, {_WIDEST_MARGIN_M:g}]: give metres, a few centimetres"
+            )
 
     def __str__(self) -> str:
         """Say it in words, as a card does."""
@@ -59,7 +67,20 @@ class ActingSettings:
         return (
             f"the best of {self.num_candidates} actions within {self.spread:g} x the policy's spread, by the "
             f"{self.over_critics} over its critics"
+            + (f", told that all is {100.0 * self.margin_m:g} cm nearer" if self.margin_m > 0.0 else "")
         )
+
+    def check_heads(self, look_ahead: bool) -> None:
+        """Refuse a margin that heads do not read.
+
+        Raises:
+            UserInputError: if they do not look ahead.
+        """
+        if self.chooses and self.margin_m > 0.0 and not look_ahead:
+            raise UserInputError(
+                f"acting.margin_m={self.margin_m:g} needs an agent with network.look_ahead=true, which foresees "
+                "clearances: leave it out"
+            )
 
     @property
     def chooses(self) -> bool:

@@ -9,6 +9,7 @@ from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.distortion import PSI, distorted, fractions_of
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.look_ahead import nearer
 
 # The largest sum over the critics is where the largest mean is.
 _OVER: Mapping[str, np.ufunc] = {"minimum": np.minimum, "mean": np.add}
@@ -27,7 +28,7 @@ class ActionChoice:
         critics: of the agent.
 
     Raises:
-        UserInputError: if the agent's risk measure is none that is known without torch.
+        UserInputError: if the agent's risk measure is none that is known without torch, or its heads read no margin.
     """
 
     def __init__(self, settings: ActingSettings, config: AgentConfig, actor: Actor, critics: Critics) -> None:
@@ -37,6 +38,8 @@ class ActionChoice:
                 f"which knows {', '.join(PSI)}: add it to rcdsac_trl.deploy.policy.distortion.PSI, or act by "
                 "acting.num_candidates=1"
             )
+        settings.check_heads(config.look_ahead)  # a policy may be told to act otherwise than its config says
+        self._margin_m = settings.margin_m
         self._config, self._actor, self._critics = config, actor, critics
         self._noise = settings.noise()
         self._over = _OVER[settings.over_critics]
@@ -52,7 +55,8 @@ class ActionChoice:
             embedded: the same in [0, 1].
         """
         candidates = self._actor.action(read[0], embedded, self._noise)
-        values = self._critics.means(read[1:], candidates, self._gate_at(beta, embedded))
+        told = read[1:] if self._margin_m == 0.0 else nearer(read[1:], self._margin_m)
+        values = self._critics.means(told, candidates, self._gate_at(beta, embedded))
         best: Array = candidates[np.argmax(self._over.reduce(values))]
         return best
 

@@ -116,6 +116,7 @@ class AgentConfig:
                 f"look_ahead={self.look_ahead} with memory_s={self.memory_s:g}: it is true or false, and an agent "
                 "without a memory foresees nothing"
             )
+        self.acting.check_heads(self.look_ahead)
         if self.critic not in ("quantile", "scalar"):
             raise UserInputError(f"critic={self.critic!r} is neither 'quantile' nor 'scalar'")
         if set(self.network) != set(_WIDTHS) or not all(type(w) is int and w >= 1 for w in self.network.values()):
