@@ -79,7 +79,7 @@ class ActingSettings:
         if self.chooses and self.margin_m > 0.0 and not look_ahead:
             raise UserInputError(
                 f"acting.margin_m={self.margin_m:g} needs an agent with network.look_ahead=true, which foresees "
-                "clearances: leave it out"
+                "clearances: set acting.margin_m=0"
             )
 
     @property
