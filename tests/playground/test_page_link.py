@@ -12,9 +12,9 @@ from rcdsac_trl.playground.scene_choice import SceneChoice
 @pytest.mark.parametrize(
     ("agent", "scene"),
     [
-        ("rcdsac_pow-narrow", SceneChoice("rcdsac_pow-narrow", -1.5, second="rcdsac_pow-narrow", beta2=0.0)),
-        ("rcwr-narrow", SceneChoice("rcwr-narrow")),
-        ("sac-narrow", SceneChoice("sac-narrow")),
+        ("rcdsac_pow-narrow", SceneChoice("rcdsac_pow-narrow", -1.5, "hard", second="rcdsac_pow-narrow", beta2=0.0)),
+        ("rcwr-narrow", SceneChoice("rcwr-narrow", map="hard")),
+        ("sac-narrow", SceneChoice("sac-narrow", map="hard")),
     ],
 )
 def test_the_usual_scene_shows_what_beta_does_where_there_is_one(agent: str, scene: SceneChoice) -> None:
@@ -29,5 +29,6 @@ def test_a_link_that_says_something_opens_that() -> None:
 
 
 def test_a_scene_that_is_not_offered_is_refused() -> None:
-    with pytest.raises(UserInputError, match="no map moon is offered"):
-        read_link({"map": "moon"}, offers())
+    for name, told in (("moon", "moon"), ("", "''"), ("../hard", "../hard"), ("hard\n", r"hard\?")):
+        with pytest.raises(UserInputError, match=rf"^no map {told} is offered"):
+            read_link({"map": name}, offers())

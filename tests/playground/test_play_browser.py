@@ -275,6 +275,66 @@ def test_sessions_share_nothing_one_too_many_is_told_so_and_a_closed_tab_ends_it
     first.wait_for_function(f"parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > {before}")
 
 
+def test_two_robots_start_equal_in_two_tabs_and_one_that_ends_leaves_the_other(opened, server: PlayServer) -> None:
+    first, second = (standing(opened("map=hard&seed=2&paused=on"), steps=3) for _ in range(2))
+    bodies = [
+        model(page, "map0", "Array.from(model.renderers.at(-1).data_source.data.get('xs')[0])")
+        for page in (first, second)
+    ]
+    assert bodies[0] == bodies[1]
+    first.close()
+    until(lambda: server.num_drives == 1)
+    second.keyboard.press(".")
+    second.wait_for_function("document.querySelector('#robot0 [data-field=time]').textContent === '0.5 s'")
+
+
+def test_zoomed_in_each_map_follows_its_robot_and_a_message_moves_nothing(opened) -> None:
+    page = standing(
+        opened("map=hard&beta=0.26&beta2=1&second=rcdsac_cvar-narrow&agent=rcdsac_cvar-narrow&paused=on"), 2
+    )
+    assert [field(page, "word", number) for number in (0, 1)] == ["careful", "neutral"]
+    before = page.locator("#stage").bounding_box()
+    page.get_by_role("button", name="zoom in").click()
+    for name in ("map0", "map1"):
+        until(lambda name=name: model(page, name, "model.x_range.end - model.x_range.start") == pytest.approx(9.0))
+        middle, x = (
+            model(page, name, code)
+            for code in (
+                "(model.x_range.start + model.x_range.end) / 2",
+                "model.renderers.at(-2).data_source.data.get('x').at(-1)",
+            )
+        )
+        assert middle == pytest.approx(x)
+    for _ in range(5):
+        page.keyboard.press("o")
+    page.locator("#message", has_text="4 obstacles are there already").wait_for()
+    assert page.locator("#stage").bounding_box() == before
+
+
+def test_a_server_that_ends_is_said_to_and_one_that_answers_again_opens_the_scene(
+    browser: Browser, tmp_path: Path
+) -> None:
+    def serve(port: int) -> PlayServer:
+        return PlayServer(offers(), host="localhost", port=port, max_sessions=2, films=tmp_path)
+
+    page = browser.new_page()
+    page.set_default_timeout(1000 * PATIENCE_S)
+    with in_thread(lambda: serve(0)) as server:
+        page.goto(f"{server.address}?agent=sac-narrow&seed=4&paused=on")
+        standing(page, 2)
+    page.locator("#message", has_text="The server does not answer").wait_for()
+    with in_thread(lambda: serve(server.port)) as again:
+        standing(page)  # from the start
+        assert "seed=4" in page.url
+        assert again.num_drives == 1
+        page.go_back()
+        until(lambda: again.num_drives == 0)
+        page.go_forward()
+        standing(page, 1)  # its own drive, not what a cache has kept of the one before
+        page.close()
+        until(lambda: again.num_drives == 0)
+
+
 def test_two_robots_stand_side_by_side_and_a_narrow_window_below_each_other(opened, tmp_path) -> None:
     page = driving(opened("agent=rcdsac_pow-narrow&beta=-2&second=mppi&seed=3", dark=True))
     boxes = [page.locator(f"#robot{number} .map").bounding_box() for number in (0, 1)]

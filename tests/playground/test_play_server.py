@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from bokeh.document.models import DocumentModelManager
 from scenes_to_play import offers
-from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
@@ -136,6 +136,27 @@ def test_one_page_too_many_gets_a_sentence(server: PlayServer) -> None:
     status, told = _refused(server, "/")
     assert status == 503
     assert told.startswith("max_sessions=1, and so many pages drive already")
+
+
+def test_a_name_is_known_however_it_is_spelt(server: PlayServer) -> None:
+    assert "static/js/bokeh.min.js" in _get(server, "/", f"LocalHost:{server.port}")
+
+
+@pytest.mark.parametrize("path", ["/play", "/autoload.js?bokeh-autoload-element=x", "/metadata", "//", "/films/a/b"])
+def test_where_nothing_is_a_sentence_says_so(server: PlayServer, path: str) -> None:
+    status, told = _refused(server, path)
+    assert status == 404
+    assert told == f"there is no {path.partition('?')[0]} here: the page is at /"
+    assert not server._server.get_sessions()
+
+
+def test_no_browser_keeps_a_page_for_another_tab(server: PlayServer) -> None:
+    async def fetched(path: str) -> str | None:
+        answer = await AsyncHTTPClient().fetch(f"{server.address}{path}")
+        return answer.headers.get("Cache-Control")
+
+    assert IOLoop.current().run_sync(lambda: fetched("")) == "no-store"
+    assert IOLoop.current().run_sync(lambda: fetched("static/js/bokeh.min.js")) != "no-store"
 
 
 @pytest.mark.parametrize("path", ["/", "/films/play-1.gif", "/static/js/bokeh.min.js"])

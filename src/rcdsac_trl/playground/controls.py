@@ -36,7 +36,7 @@ class Controls:
         visitor: is told what is done with them, but for what the page does by itself.
         save: makes a film.
         restyle: gives the page the theme of a name.
-        zoom: shows what is around the robot, or all of the map.
+        zoom: shows what is around each robot, or all of the map.
 
     Attributes:
         betas: the sliders.
@@ -104,7 +104,7 @@ class Controls:
 
     @property
     def zoomed(self) -> bool:
-        """Whether what is around the robot is shown, not all of the map."""
+        """Whether what is around each robot is shown, not all of the map."""
         return bool(self._zoom.active)
 
     def _made_fields(self, offers: Offers) -> dict[str, Select | Spinner]:

@@ -1,7 +1,7 @@
 """A page's link, read and checked before anything of the page is made."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.cast import cast
@@ -10,6 +10,7 @@ from rcdsac_trl.playground.palette import THEMES
 from rcdsac_trl.playground.scene_choice import SceneChoice, shortened
 
 _CAREFUL = 0.25
+_EVENTFUL = "hard"
 # What a link may say of the page itself.
 _OWN_KEYS: Mapping[str, tuple[str, ...]] = {"theme": THEMES, "paused": ("on", "off")}
 
@@ -52,12 +53,13 @@ def read_link(query: Mapping[str, str], offers: Offers) -> PageLink:
 def usual_scene(offers: Offers) -> SceneChoice:
     """Return what is shown unless a link says it: the first agent twice, side by side, careful and as bold as can be.
 
-    Careful is a quarter above the lowest value that it was trained with: at the very end some agents hardly move.
+    Careful is a quarter above the lowest value that it was trained with: at the very end some agents hardly move. Where
+    much stands in the way, there is much to be careful of.
     """
-    alone = SceneChoice(next(iter(offers.agents)))
+    alone = SceneChoice(next(iter(offers.agents)), map=_EVENTFUL)
     (part,) = cast(alone, offers)
     dial = part.driver.dial
     if dial is None or part.driver.measure is None:  # without a measure, what is dialled is no beta
         return alone
     careful = round(dial.low + _CAREFUL * (dial.high - dial.low), 2)
-    return SceneChoice(part.name, careful, second=part.name, beta2=dial.high)
+    return replace(alone, beta=careful, second=part.name, beta2=dial.high)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bokeh.document import Document
-from bokeh.events import DocumentReady
+from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.models import CustomJS, Div
 
 from rcdsac_trl.playground.controls import Controls
@@ -24,7 +24,9 @@ from rcdsac_trl.playground.stage import Stage
 from rcdsac_trl.playground.visitor import Visitor
 
 _HERE = Path(__file__).parent
-_TEMPLATE, _STYLE, _CODE = ((_HERE / f"page.{kind}").read_text("utf-8") for kind in ("html", "css", "js"))
+_TEMPLATE, _STYLE, _CODE, _LOST = (
+    (_HERE / name).read_text("utf-8") for name in ("page.html", "page.css", "page.js", "page_lost.js")
+)
 _TAKE_THEME = (
     "const dark = window.matchMedia('(prefers-color-scheme: dark)').matches;"
     "theme.active = asked ? asked === 'dark' : dark;"
@@ -85,6 +87,8 @@ class PlayPage:
         document.template_variables.update(palettes=style_sheet(), page_css=_STYLE, opening=OPENING)
         document.js_on_event(DocumentReady, CustomJS(args={"theme": switch, "asked": theme or ""}, code=_TAKE_THEME))
         document.on_event(DocumentReady, lambda event: self._begin())
+        document.config.update(reconnect_session=False, notify_connection_status=False)
+        document.js_on_event(ConnectionLost, CustomJS(code=_LOST))
         document.on_session_destroyed(lambda context: self.close())
 
     def _begin(self) -> None:

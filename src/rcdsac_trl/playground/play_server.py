@@ -18,8 +18,9 @@ from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
 from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPHeaders
 from tornado.ioloop import IOLoop
-from tornado.web import HTTPError, RequestHandler
+from tornado.web import HTTPError, OutputTransform, RequestHandler
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.drive_clock import DriveClock
@@ -77,6 +78,7 @@ class PlayServer:
             unused_session_lifetime_milliseconds=_UNUSED_MS,
             check_unused_sessions_milliseconds=_CHECK_UNUSED_MS,
             websocket_max_message_size_bytes=_LARGEST_MESSAGE_BYTES,
+            transforms=[_NotKept],
         )
         self._http = HTTPServer(guarded(pages, known, self._check))
         self._http.add_sockets(sockets)
@@ -175,7 +177,7 @@ def in_thread(make: Callable[[], PlayServer]) -> Iterator[PlayServer]:
         loop = IOLoop(make_current=False)
         loop.add_callback(begin, loop)
         loop.start()
-        loop.close()
+        loop.close(all_fds=True)  # so that open pages notice
 
     def begin(loop: IOLoop) -> None:
         try:
@@ -199,6 +201,21 @@ def in_thread(make: Callable[[], PlayServer]) -> Iterator[PlayServer]:
         loop.add_callback(server.stop)
         loop.add_callback(loop.stop)
         thread.join()
+
+
+class _NotKept(OutputTransform):
+    """Keeps pages out of browsers' caches, from which they are taken when one goes back, or doubles a tab.
+
+    Each page is of one drive: from there it would be shared, or of a drive that has ended.
+    """
+
+    def transform_first_chunk(
+        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
+    ) -> tuple[int, HTTPHeaders, bytes]:
+        """Mark pages."""
+        if headers.get("Content-Type", "").startswith("text/html"):
+            headers["Cache-Control"] = "no-store"
+        return status_code, headers, chunk
 
 
 class _FilmHandler(RequestHandler):

@@ -9,7 +9,7 @@ from bokeh.models import ColumnDataSource, Plot
 
 from rcdsac_trl.playground.critic_figures import ReturnFigure, ValueFigure
 from rcdsac_trl.playground.drive_clock import View
-from rcdsac_trl.playground.map_figure import MapFigure, MapRanges
+from rcdsac_trl.playground.map_figure import MapFigure
 from rcdsac_trl.playground.palette import PALETTES
 from rcdsac_trl.playground.silence import Silence
 from rcdsac_trl.playground.view_state import RobotView
@@ -31,10 +31,9 @@ class Stage:
     def __init__(self, theme: str, tapped: Callable[[Tap], None], dragged: Callable[[int, float, float], None]) -> None:
         self._silence = Silence()
         self._tell_dragged = dragged
-        self._ranges = MapRanges()
         self._obstacles = ColumnDataSource(data={key: [] for key in _OBSTACLE_COLUMNS})
         self._obstacles.on_change("data", self._silence.unless_silent(self._dragged))
-        self._maps = [MapFigure(self._ranges, self._obstacles, f"map{number}") for number in (0, 1)]
+        self._maps = [MapFigure(self._obstacles, f"map{number}") for number in (0, 1)]
         self._curves = [ReturnFigure(f"curve{number}") for number in (0, 1)]
         self._values = [ValueFigure(f"values{number}") for number in (0, 1)]
         self._plots: list[MapFigure | ReturnFigure | ValueFigure] = [*self._maps, *self._curves, *self._values]
@@ -62,13 +61,13 @@ class Stage:
 
         Args:
             view: newer than what was shown before.
-            zoomed: whether to show what is around the first robot, not all of the map.
+            zoomed: whether to show what is around each robot, not all of the map.
             settled: whether all that was done with the page is in it; if not, an obstacle may be on its way.
         """
         if view.scene_number != self._scene_number:
             self._scene_number = view.scene_number
             for map_ in self._maps:
-                map_.draw_map(view.map, self._colors)
+                map_.draw_map(view.map, view.glass, self._colors)
             self.look(view, zoomed)
         elif zoomed:
             self.look(view, zoomed)
@@ -84,8 +83,9 @@ class Stage:
                 values.copy(robot)
 
     def look(self, view: View, zoomed: bool) -> None:
-        """Show all of a view's map, or what is around the first robot."""
-        self._ranges.show(view.map, view.robots[0].pose[:2] if zoomed else None)
+        """Show all of a view's map, or what is around each robot."""
+        for robot, map_ in zip(view.robots, self._maps, strict=False):
+            map_.look(view.map, robot.pose[:2] if zoomed else None)
 
     def _dragged(self, attr: str, old: dict[str, Any], new: dict[str, Any]) -> None:
         if self._shown is None:
