@@ -2,8 +2,8 @@
 
     python docs/images/play_film.py
 
-It needs the packages of the extra `dev`, and Chromium. The scene is the one with which the page opens, unless its neutral
-robot touches nothing within the time, or the careful one something: then it is the next seed of which this holds.
+It needs the packages of the extra `dev`, and Chromium. The scene is the one with which the page opens, unless its
+neutral robot touches nothing within the time, or the careful one something: then it is the next seed without that.
 """
 
 import io
@@ -118,7 +118,6 @@ def main() -> None:
                 page.set_default_timeout(300_000)
                 page.goto(f"{address[0]}?{shot.scene.query}&paused=on")
                 page.wait_for_function("document.querySelector('#robot1 [data-field=time]').textContent")
-                page.get_by_role("button", name="zoom in").click()
                 fps = 1.0 / (STEPS_A_FRAME * shot.period_s)
                 _, film = write_video(frames(page, shot), Path(folder) / "play", fps)
                 browser.close()

@@ -6,7 +6,7 @@ from scenes_to_play import offers
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.page_link import PageLink, read_link, usual_scene
-from rcdsac_trl.playground.scene_choice import SceneChoice
+from rcdsac_trl.playground.scene_choice import NOBODY, SceneChoice
 
 
 @pytest.mark.parametrize(
@@ -20,12 +20,14 @@ from rcdsac_trl.playground.scene_choice import SceneChoice
 def test_the_usual_scene_shows_what_beta_does_where_there_is_one(agent: str, scene: SceneChoice) -> None:
     only = Offers({agent: agent}, offers().maps)
     assert usual_scene(only) == scene
-    assert read_link({"theme": "dark", "paused": "on"}, only) == PageLink(scene, "dark", running=False)
+    zoomed = scene.second != NOBODY
+    assert read_link({"theme": "dark", "paused": "on"}, only) == PageLink(scene, "dark", running=False, zoomed=zoomed)
+    assert not read_link({"zoom": "off"}, only).zoomed
 
 
 def test_a_link_that_says_something_opens_that() -> None:
     said = SceneChoice(next(iter(offers().agents)), seed=2)
-    assert read_link({"seed": "2", "paused": "off"}, offers()) == PageLink(said, None, running=True)
+    assert read_link({"seed": "2", "paused": "off"}, offers()) == PageLink(said, None, running=True, zoomed=False)
 
 
 def test_a_scene_that_is_not_offered_is_refused() -> None:

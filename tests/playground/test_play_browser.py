@@ -294,7 +294,6 @@ def test_zoomed_in_each_map_follows_its_robot_and_a_message_moves_nothing(opened
     )
     assert [field(page, "word", number) for number in (0, 1)] == ["careful", "neutral"]
     before = page.locator("#stage").bounding_box()
-    page.get_by_role("button", name="zoom in").click()
     for name in ("map0", "map1"):
         until(lambda name=name: model(page, name, "model.x_range.end - model.x_range.start") == pytest.approx(9.0))
         middle, x = (
@@ -305,6 +304,8 @@ def test_zoomed_in_each_map_follows_its_robot_and_a_message_moves_nothing(opened
             )
         )
         assert middle == pytest.approx(x)
+    page.get_by_role("button", name="zoom in").click()
+    until(lambda: model(page, "map1", "model.x_range.end - model.x_range.start") == pytest.approx(20.8))
     for _ in range(5):
         page.keyboard.press("o")
     page.locator("#message", has_text="4 obstacles are there already").wait_for()
@@ -320,31 +321,31 @@ def test_a_server_that_ends_is_said_to_and_one_that_answers_again_opens_the_scen
     page = browser.new_page()
     page.set_default_timeout(1000 * PATIENCE_S)
     with in_thread(lambda: serve(0)) as server:
-        page.goto(f"{server.address}?agent=sac-narrow&seed=4&paused=on")
+        page.goto(f"{server.address}?agent=sac-narrow&seed=4&theme=dark&paused=on")
         standing(page, 2)
     page.locator("#message", has_text="The server does not answer").wait_for()
     with in_thread(lambda: serve(server.port)) as again:
-        standing(page)  # from the start
-        assert "seed=4" in page.url
+        driving(page)
         assert again.num_drives == 1
+        assert page.url.endswith("?agent=sac-narrow&seed=4&theme=dark")
         page.go_back()
-        until(lambda: again.num_drives == 0)
         page.go_forward()
-        standing(page, 1)  # its own drive, not what a cache has kept of the one before
+        driving(page)  # its own drive, not what a cache has kept of the one before
         page.close()
-        until(lambda: again.num_drives == 0)
 
 
-def test_two_robots_stand_side_by_side_and_a_narrow_window_below_each_other(opened, tmp_path) -> None:
+def test_two_robots_stand_side_by_side_in_a_narrow_window_too(opened, tmp_path) -> None:
     page = driving(opened("agent=rcdsac_pow-narrow&beta=-2&second=mppi&seed=3", dark=True))
-    boxes = [page.locator(f"#robot{number} .map").bounding_box() for number in (0, 1)]
-    assert boxes[0] is not None
-    assert boxes[1] is not None
-    assert boxes[1]["x"] > boxes[0]["x"] + boxes[0]["width"]
+    beside = (
+        "() => document.querySelector('#robot1 .map').getBoundingClientRect().left"
+        " >= document.querySelector('#robot0 .map').getBoundingClientRect().right"
+    )
+    assert page.evaluate(beside)
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
     assert field(page, "name", 1) == "mppi"
     picture(page, "two-dark", tmp_path)
     page.set_viewport_size({"width": 420, "height": 900})
-    page.wait_for_function("document.querySelector('#robot1').getBoundingClientRect().left < 30")
+    page.wait_for_function("document.querySelector('#robot0 .plot').getBoundingClientRect().width > 350")
+    assert page.evaluate(beside)
     assert page.evaluate("document.documentElement.scrollWidth") <= 420  # nothing sticks out
     picture(page, "narrow", tmp_path)

@@ -1,5 +1,6 @@
 """The server without a browser: who may connect, what may be fetched, how many may drive, and what is refused."""
 
+import gc
 import os
 import re
 import signal
@@ -8,6 +9,7 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -227,6 +229,28 @@ def test_without_the_package_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UserInputError, match=r"pip install 'rcdsac-trl\[play\]'"):
         read_config(compose("play", []), PlaySettings)
+
+
+def test_no_ctrl_c_is_lost_to_what_collects_garbage(tmp_path: Path) -> None:
+    class Garbage:
+        pass
+
+    def collect() -> None:
+        garbage = Garbage()
+        last_words = weakref.ref(garbage, lambda ref: signal.raise_signal(signal.SIGINT))
+        del garbage
+        assert last_words() is None
+
+    server = PlayServer(offers(), host="localhost", port=0, max_sessions=1, films=tmp_path)
+    loop = IOLoop.current()
+    loop.call_later(0.1, collect)
+    over = loop.call_later(60.0, loop.stop)  # else it would serve for good
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            server.run(browser=False)
+    finally:
+        loop.remove_timeout(over)
+        gc.unfreeze()
 
 
 def test_the_program_says_where_it_is_and_ends_with_ctrl_c(tmp_path: Path) -> None:

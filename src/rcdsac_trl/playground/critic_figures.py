@@ -43,7 +43,7 @@ class ReturnFigure:
         self._weight_range = Range1d(0.0, _HEAVY)
         plot.extra_y_ranges = {"weight": self._weight_range}
         weights = BasicTicker(desired_num_ticks=4, num_minor_ticks=0)
-        plot.add_layout(LinearAxis(y_range_name="weight", axis_label="weight at this β", ticker=weights), "right")
+        plot.add_layout(LinearAxis(y_range_name="weight", axis_label="weight", ticker=weights), "right")
         self._curve = ColumnDataSource(data={"x": [], "quantile": [], "weight": [], "width": []})
         self._levels = ColumnDataSource(data={"y": [], "color": [], "dash": []})
         self._bars = plot.vbar(

@@ -147,12 +147,13 @@ class MapFigure:
             bar_line_width=2,
             bar_line_color=colors["ink"],
             label_text_color=colors["ink"],
+            label_text_font_size="11px",
             label_standoff=2,
             background_fill_color=colors["floor"],
-            background_fill_alpha=0.8,
+            background_fill_alpha=0.6,
             border_line_color=None,
-            padding=4,
-            margin=14,
+            padding=2,
+            margin=8,
         )
         self.figure.add_layout(self._scale_bar)
 
@@ -256,10 +257,10 @@ def _discs(view: RobotView, colors: Colors) -> dict[str, list]:
         (x, y, radius, colors["goal"], alpha, colors["goal"])
         for radius, alpha in zip(_GOAL_RADII_M, (0.2, 1.0), strict=True)
     ]
-    for x, y, radius in view.movers.tolist():
-        rows.append((x, y, radius, colors["mover"], 1.0, colors["mover"]))
     for x, y in view.remembered.tolist():
         rows.append((x, y, _REMEMBERED_RADIUS_M, colors["remembered"], 0.7, colors["remembered"]))
+    for x, y, radius in view.movers.tolist():
+        rows.append((x, y, radius, colors["mover"], 1.0, colors["mover"]))
     for x, y, radius in view.expected.tolist():
         rows.append((x, y, radius, colors["remembered"], 0.0, colors["remembered"]))
     return {key: list(column) for key, column in zip(_COLUMNS["discs"], zip(*rows, strict=True), strict=True)}

@@ -42,8 +42,10 @@ if (film.dataset.shown !== JSON.stringify(state.film)) {
     film.append(" ", link);
   }
 }
-if (!state.refused && window.location.search !== "?" + state.query)
-  window.history.replaceState(null, "", "?" + state.query);
+const asked = new URLSearchParams(window.location.search);
+const kept = ["theme", "zoom"].filter((key) => asked.has(key)).map((key) => "&" + key + "=" + asked.get(key));
+const query = "?" + state.query + kept.join("");
+if (!state.refused && window.location.search !== query) window.history.replaceState(null, "", query);
 
 if (window.playKeys === undefined) {
   // Else who holds an obstacle for a moment, or has a slow machine, could not drag it: it would be a press.

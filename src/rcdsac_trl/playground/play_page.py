@@ -17,6 +17,7 @@ from bokeh.models import CustomJS, Div
 from rcdsac_trl.playground.controls import Controls
 from rcdsac_trl.playground.drive_clock import DriveClock, View
 from rcdsac_trl.playground.offers import Offers
+from rcdsac_trl.playground.page_link import PageLink
 from rcdsac_trl.playground.page_words import OPENING, refusal_words, view_words
 from rcdsac_trl.playground.palette import style_sheet
 from rcdsac_trl.playground.play_film import FilmStudio
@@ -45,7 +46,7 @@ class PlayPage:
     Args:
         document: that becomes the page.
         clock: the drive.
-        theme: light or dark; None: as the browser has it.
+        link: that it was opened with.
         offers: what can be chosen.
         studio: makes films.
 
@@ -55,7 +56,7 @@ class PlayPage:
     """
 
     def __init__(
-        self, document: Document, clock: DriveClock, theme: str | None, offers: Offers, studio: FilmStudio
+        self, document: Document, clock: DriveClock, link: PageLink, offers: Offers, studio: FilmStudio
     ) -> None:
         self.document, self.begun = document, False
         self._clock, self._studio = clock, studio
@@ -69,9 +70,11 @@ class PlayPage:
         self._keys_heard = self._steps_drawn = 0
         self._visitor = visitor = Visitor(clock)
         self._stage = Stage(self._theme, visitor.tap, visitor.move_obstacle)
-        self._controls = Controls(offers, visitor, save=self._save, restyle=self._restyle, zoom=self._look_around)
+        self._controls = Controls(
+            offers, visitor, link.zoomed, save=self._save, restyle=self._restyle, zoom=self._look_around
+        )
         self._wire = Div(name="wire", text="", visible=False, tags=[])
-        self._compose(theme)
+        self._compose(link.theme)
 
     # ------------------------------------------------------------------------------------------- its life
     def _compose(self, theme: str | None) -> None:

@@ -19,7 +19,7 @@ from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPHeaders
-from tornado.ioloop import IOLoop
+from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import HTTPError, OutputTransform, RequestHandler
 
 from rcdsac_trl.errors import UserInputError
@@ -29,6 +29,7 @@ from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.page_link import PageLink, read_link
 from rcdsac_trl.playground.play_film import FilmStudio
 from rcdsac_trl.playground.play_page import PlayPage
+from rcdsac_trl.system.interrupts import at_safe_points, interruption_point
 from rcdsac_trl.system.listening import cannot_listen, check_can_listen
 
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
@@ -37,6 +38,8 @@ _ALL_ADDRESSES = ("0.0.0.0", "::")
 _UNUSED_MS = 15_000
 _CHECK_UNUSED_MS = 1000
 _LARGEST_MESSAGE_BYTES = 1_000_000
+# So often it looks whether Ctrl-C was pressed.
+_LISTEN_MS = 200
 _PATH = "/"
 
 
@@ -110,9 +113,14 @@ class PlayServer:
         gc.freeze()
         if browser:
             webbrowser.open(self.address)
+        # Python would lose a Ctrl-C that comes while garbage is collected, as it is for every page that ends.
+        listening = PeriodicCallback(interruption_point, _LISTEN_MS)
+        listening.start()
         try:
-            self._server.io_loop.start()
+            with at_safe_points():
+                self._server.io_loop.start()
         finally:
+            listening.stop()
             self.stop()
 
     def stop(self) -> None:
@@ -132,7 +140,7 @@ class PlayServer:
             return
         clock = DriveClock(link.choice, self._offers, running=link.running)
         self._clocks.add(clock)
-        page = PlayPage(document, clock, link.theme, self._offers, self._studio)
+        page = PlayPage(document, clock, link, self._offers, self._studio)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._forget(page))
 
