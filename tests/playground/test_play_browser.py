@@ -144,6 +144,13 @@ def obstacles(page: Page) -> list[list[float]]:
     return filled(page, OBSTACLE)
 
 
+def places(page: Page, name: str) -> list[list[float]]:
+    """Return what is marked on a map, m: contacts, and the robot's place at the end."""
+    code = "['x', 'y'].map((key) => Array.from(marks.get ? marks.get(key) : marks[key]))"
+    x, y = model(page, name, f"((marks) => {code})(model.renderers.at(-2).data_source.data)")
+    return [list(place) for place in zip(x, y, strict=True)]
+
+
 def picture(page: Page, name: str, tmp_path: Path) -> None:
     """Keep a screenshot beside the test's other files, for who wants to look."""
     path = tmp_path / f"{name}.png"
@@ -277,11 +284,7 @@ def test_sessions_share_nothing_one_too_many_is_told_so_and_a_closed_tab_ends_it
 
 def test_two_robots_start_equal_in_two_tabs_and_one_that_ends_leaves_the_other(opened, server: PlayServer) -> None:
     first, second = (standing(opened("map=hard&seed=2&paused=on"), steps=3) for _ in range(2))
-    bodies = [
-        model(page, "map0", "Array.from(model.renderers.at(-1).data_source.data.get('xs')[0])")
-        for page in (first, second)
-    ]
-    assert bodies[0] == bodies[1]
+    assert places(first, "map0") == places(second, "map0")
     first.close()
     until(lambda: server.num_drives == 1)
     second.keyboard.press(".")
@@ -296,14 +299,8 @@ def test_zoomed_in_each_map_follows_its_robot_and_a_message_moves_nothing(opened
     before = page.locator("#stage").bounding_box()
     for name in ("map0", "map1"):
         until(lambda name=name: model(page, name, "model.x_range.end - model.x_range.start") == pytest.approx(9.0))
-        middle, x = (
-            model(page, name, code)
-            for code in (
-                "(model.x_range.start + model.x_range.end) / 2",
-                "model.renderers.at(-2).data_source.data.get('x').at(-1)",
-            )
-        )
-        assert middle == pytest.approx(x)
+        middle = model(page, name, "(model.x_range.start + model.x_range.end) / 2")
+        assert middle == pytest.approx(places(page, name)[-1][0])
     page.get_by_role("button", name="zoom in").click()
     until(lambda: model(page, "map1", "model.x_range.end - model.x_range.start") == pytest.approx(20.8))
     for _ in range(5):

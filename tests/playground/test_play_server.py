@@ -10,6 +10,7 @@ import sys
 import urllib.error
 import urllib.request
 import weakref
+from asyncio import sleep
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -131,6 +132,21 @@ def test_a_bad_link_gets_a_sentence_before_a_page_is_made(
     assert status == 400
     assert told.startswith(sentence)
     assert not server._server.get_sessions()
+
+
+def test_a_closed_tab_ends_its_page_and_one_that_loads_slowly_keeps_its_own(tmp_path: Path) -> None:
+    server = PlayServer(offers(), host="localhost", port=0, max_sessions=2, films=tmp_path)
+    server.start()
+    for seed in (0, 1):
+        _get(server, f"/?agent=dwa&paused=on&seed={seed}")
+    shown, loading = server._pages
+    shown._begin()  # and no browser is connected any more
+    for _ in range(100):
+        IOLoop.current().run_sync(lambda: sleep(0.1))
+        if shown not in server._pages:
+            break
+    assert server._pages == [loading]
+    server.stop()
 
 
 def test_one_page_too_many_gets_a_sentence(server: PlayServer) -> None:

@@ -230,7 +230,8 @@ class CourseArena:
 
     def __init__(self, office: Office, config: Any, seed: int) -> None:
         self.map = office.map
-        self.glass = [piece.footprint for piece in office.pieces if piece.glass and isinstance(piece.footprint, Box)]
+        panes = (piece.footprint for piece in office.pieces if piece.glass)
+        self.glass: Sequence[Box] = [pane for pane in panes if isinstance(pane, Box)]
         self._office, self._config = office, config
         conditions = Conditions(Lens(), OdometrySettings(), math.inf, seed)
         self._world = CourseWorld(

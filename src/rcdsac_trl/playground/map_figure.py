@@ -132,8 +132,7 @@ class MapFigure:
 
     def restyle(self, colors: Colors) -> None:
         """Take another theme's colours, but for what is copied."""
-        self.figure.background_fill_color = colors["floor"]
-        self.figure.border_fill_color = colors["outside"]
+        self.figure.background_fill_color = self.figure.border_fill_color = colors["outside"]
         self._speeds.palette = trail_shades(colors)
         # A new one: a browser draws it once.
         if self._scale_bar is not None:
@@ -176,11 +175,13 @@ class MapFigure:
             colors: of the theme.
         """
         boxes = sorted(map_.boxes, key=lambda box: box.wall)
-        corners = [box.corners() for box in boxes]
+        size_m = map_.size_m
+        floor = np.array([(0.0, 0.0), (size_m, 0.0), (size_m, size_m), (0.0, size_m)])
+        corners = [floor, *(box.corners() for box in boxes)]
         self._sources["static"].data = {
             "xs": [corner[:, 0] for corner in corners],
             "ys": [corner[:, 1] for corner in corners],
-            "fill": [colors["glass"] if box in glass else _box_color(box, colors) for box in boxes],
+            "fill": [colors["floor"], *(colors["glass"] if box in glass else _box_color(box, colors) for box in boxes)],
         }
         self._sources["round"].data = {
             "x": [piece.x for piece in map_.cylinders],

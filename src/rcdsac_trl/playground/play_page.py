@@ -53,12 +53,13 @@ class PlayPage:
     Attributes:
         document: likewise.
         begun: whether a browser has shown it.
+        made_s: when it was made, on the monotonic clock.
     """
 
     def __init__(
         self, document: Document, clock: DriveClock, link: PageLink, offers: Offers, studio: FilmStudio
     ) -> None:
-        self.document, self.begun = document, False
+        self.document, self.begun, self.made_s = document, False, time.monotonic()
         self._clock, self._studio = clock, studio
         self._theme = "light"
         self._ended: str | None = None

@@ -4,6 +4,7 @@ import gc
 import queue
 import socket
 import threading
+import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,8 +35,11 @@ from rcdsac_trl.system.listening import cannot_listen, check_can_listen
 
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 _ALL_ADDRESSES = ("0.0.0.0", "::")
-# A page that nobody looks at any more ends after this.
-_UNUSED_MS = 15_000
+# A page that no browser has shown ends after this: a slow one, or a slow way to it, takes its time. Where there is no
+# room, it gives its place away sooner.
+_UNUSED_MS = 120_000
+_WAITED_FOR_S = 15.0
+# So often it looks which pages nobody looks at any more.
 _CHECK_UNUSED_MS = 1000
 _LARGEST_MESSAGE_BYTES = 1_000_000
 # So often it looks whether Ctrl-C was pressed.
@@ -86,6 +90,7 @@ class PlayServer:
         self._http = HTTPServer(guarded(pages, known, self._check))
         self._http.add_sockets(sockets)
         self._server = BaseServer(IOLoop.current(), pages, self._http)
+        self._closed_tabs = PeriodicCallback(self._let_go, _CHECK_UNUSED_MS)
 
     @property
     def address(self) -> str:
@@ -100,6 +105,7 @@ class PlayServer:
     def start(self) -> None:
         """Answer whoever asks, while the thread's event loop runs."""
         self._server.start()
+        self._closed_tabs.start()
 
     def run(self, *, browser: bool) -> None:
         """Serve until Ctrl-C.
@@ -126,6 +132,7 @@ class PlayServer:
     def stop(self) -> None:
         """Answer no more, and end all drives."""
         self._http.stop()
+        self._closed_tabs.stop()
         for page in self._pages:
             page.close()
         self._server.stop(wait=False)
@@ -144,6 +151,13 @@ class PlayServer:
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._forget(page))
 
+    def _let_go(self) -> None:
+        """End pages that were shown and whose tab was closed."""
+        shown = [page.document for page in self._pages if page.begun]
+        for session in self._server.get_sessions(_PATH):
+            if not session.connection_count and session.document in shown:
+                session.request_expiration()
+
     def _forget(self, page: PlayPage) -> None:
         if page in self._pages:
             self._pages.remove(page)
@@ -158,7 +172,9 @@ class PlayServer:
         if len(self._pages) < self._max_sessions:
             return link
         watched = [session.document for session in self._server.get_sessions(_PATH) if session.connection_count]
-        for page in [page for page in self._pages if page.begun and page.document not in watched]:
+        now_s = time.monotonic()
+        waited_for = [page.document for page in self._pages if not page.begun and now_s - page.made_s < _WAITED_FOR_S]
+        for page in [page for page in self._pages if page.document not in [*watched, *waited_for]]:
             page.close("this page was out of reach for a moment, and another one took its place: open it again")
             self._forget(page)
         if len(self._pages) >= self._max_sessions:
