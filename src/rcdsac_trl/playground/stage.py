@@ -16,6 +16,7 @@ from rcdsac_trl.playground.view_state import RobotView
 
 # The critics' figures follow less often than the map: to draw axes takes a browser as long as everything else.
 _CRITICS_PERIOD_S = 0.35
+_CRITICS_VIEWS = 3
 _OBSTACLE_COLUMNS = ("x", "y", "radius", "fill", "line")
 
 
@@ -42,6 +43,7 @@ class Stage:
         self._scene_number = 0
         self._shown: RobotView | None = None
         self._critics_s = 0.0
+        self._views_since = _CRITICS_VIEWS
         self.restyle(theme)
 
     @property
@@ -76,11 +78,16 @@ class Stage:
             self._show_obstacles(self._shown)
         for robot, map_ in zip(view.robots, self._maps, strict=False):
             map_.copy(robot, self._colors)
-        if (now_s := time.monotonic()) - self._critics_s > _CRITICS_PERIOD_S:
-            self._critics_s = now_s
+        self._views_since += 1
+        if not view.running or self._critics_due():
+            self._critics_s, self._views_since = time.monotonic(), 0
             for robot, curve, values in zip(view.robots, self._curves, self._values, strict=False):
                 curve.copy(robot.returns, self._colors)
                 values.copy(robot)
+
+    def _critics_due(self) -> bool:
+        waited = time.monotonic() - self._critics_s > _CRITICS_PERIOD_S
+        return waited and self._views_since >= _CRITICS_VIEWS  # a slow browser shows maps first
 
     def look(self, view: View, zoomed: bool) -> None:
         """Show all of a view's map, or what is around each robot."""
