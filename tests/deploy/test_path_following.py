@@ -64,6 +64,14 @@ def visited(trail: list[Place], path: NDArray[np.float64], within_m: float) -> i
 
 
 # ------------------------------------------------------------------------------------------------ single paths
+def test_what_is_ahead_are_the_corners_not_reached_yet() -> None:
+    follower = PathFollower(LOOP, CONFIG)
+    follower.update((1.0, 0.0, 0.0))
+    assert follower.ahead.tolist() == [[4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]]
+    follower.update((3.8, 0.0, 0.0))
+    assert follower.ahead.tolist() == [[4.0, 4.0], [0.0, 4.0], [0.0, 0.0]]
+
+
 def test_a_loop_is_driven_round_before_it_is_reached() -> None:
     follower = PathFollower(LOOP, CONFIG)
     assert waypoints(follower, 0.0, 0.0) == [[4.0, 0.0], [4.0, 4.0]]

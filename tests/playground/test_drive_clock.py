@@ -147,6 +147,19 @@ def test_many_orders_at_once_cost_one_view(clock: DriveClock) -> None:
     assert newest(clock).number <= before + 2
 
 
+def test_orders_without_end_put_no_step_off(clock: DriveClock) -> None:
+    over = threading.Event()
+
+    def again(drive: object) -> None:
+        if not over.is_set():
+            clock.tell(again)
+
+    clock.tell(again)
+    steps = newest(clock).robots[0].steps
+    until(lambda: newest(clock).robots[0].steps >= steps + 3)
+    over.set()
+
+
 def test_the_moments_of_a_film_are_of_all_steps(clock: DriveClock) -> None:
     until(lambda: newest(clock).robots[0].steps >= 4)
     paused = pause(clock)

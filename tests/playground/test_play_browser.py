@@ -144,6 +144,13 @@ def obstacles(page: Page) -> list[list[float]]:
     return filled(page, OBSTACLE)
 
 
+def places(page: Page, name: str) -> list[list[float]]:
+    """Return what is marked on a map, m: contacts, and the robot's place at the end."""
+    code = "['x', 'y'].map((key) => Array.from(marks.get ? marks.get(key) : marks[key]))"
+    x, y = model(page, name, f"((marks) => {code})(model.renderers.at(-2).data_source.data)")
+    return [list(place) for place in zip(x, y, strict=True)]
+
+
 def picture(page: Page, name: str, tmp_path: Path) -> None:
     """Keep a screenshot beside the test's other files, for who wants to look."""
     path = tmp_path / f"{name}.png"
@@ -275,16 +282,67 @@ def test_sessions_share_nothing_one_too_many_is_told_so_and_a_closed_tab_ends_it
     first.wait_for_function(f"parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > {before}")
 
 
-def test_two_robots_stand_side_by_side_and_a_narrow_window_below_each_other(opened, tmp_path) -> None:
+def test_two_robots_start_equal_in_two_tabs_and_one_that_ends_leaves_the_other(opened, server: PlayServer) -> None:
+    first, second = (standing(opened("map=hard&paused=on"), steps=3) for _ in range(2))
+    assert places(first, "map0") == places(second, "map0")
+    first.close()
+    until(lambda: server.num_drives == 1)
+    second.keyboard.press(".")
+    second.wait_for_function("document.querySelector('#robot0 [data-field=time]').textContent === '0.5 s'")
+
+
+def test_zoomed_in_each_map_follows_its_robot_and_a_message_moves_nothing(opened) -> None:
+    page = standing(
+        opened("map=hard&beta=0.26&beta2=1&second=rcdsac_cvar-narrow&agent=rcdsac_cvar-narrow&paused=on"), 2
+    )
+    assert [field(page, "word", number) for number in (0, 1)] == ["careful", "neutral"]
+    before = page.locator("#stage").bounding_box()
+    for name in ("map0", "map1"):
+        until(lambda name=name: model(page, name, "model.x_range.end - model.x_range.start") == pytest.approx(9.0))
+        middle = model(page, name, "(model.x_range.start + model.x_range.end) / 2")
+        assert middle == pytest.approx(places(page, name)[-1][0])
+    page.get_by_role("button", name="zoom in").click()
+    until(lambda: model(page, "map1", "model.x_range.end - model.x_range.start") == pytest.approx(20.8))
+    for _ in range(5):
+        page.keyboard.press("o")
+    page.locator("#message", has_text="4 obstacles are there already").wait_for()
+    assert page.locator("#stage").bounding_box() == before
+
+
+def test_a_server_that_ends_is_said_to_and_one_that_answers_again_opens_the_scene(
+    browser: Browser, tmp_path: Path
+) -> None:
+    def serve(port: int) -> PlayServer:
+        return PlayServer(offers(), host="localhost", port=port, max_sessions=2, films=tmp_path)
+
+    page = browser.new_page()
+    page.set_default_timeout(1000 * PATIENCE_S)
+    with in_thread(lambda: serve(0)) as server:
+        page.goto(f"{server.address}?agent=sac-narrow&seed=4&theme=dark&paused=on")
+        standing(page, 2)
+    page.locator("#message", has_text="The server does not answer").wait_for()
+    with in_thread(lambda: serve(server.port)) as again:
+        driving(page)
+        assert again.num_drives == 1
+        assert page.url.endswith("?agent=sac-narrow&seed=4&theme=dark")
+        page.go_back()
+        page.go_forward()
+        driving(page)  # its own drive, not what a cache has kept of the one before
+        page.close()
+
+
+def test_two_robots_stand_side_by_side_in_a_narrow_window_too(opened, tmp_path) -> None:
     page = driving(opened("agent=rcdsac_pow-narrow&beta=-2&second=mppi&seed=3", dark=True))
-    boxes = [page.locator(f"#robot{number} .map").bounding_box() for number in (0, 1)]
-    assert boxes[0] is not None
-    assert boxes[1] is not None
-    assert boxes[1]["x"] > boxes[0]["x"] + boxes[0]["width"]
+    beside = (
+        "() => document.querySelector('#robot1 .map').getBoundingClientRect().left"
+        " >= document.querySelector('#robot0 .map').getBoundingClientRect().right"
+    )
+    assert page.evaluate(beside)
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
     assert field(page, "name", 1) == "mppi"
     picture(page, "two-dark", tmp_path)
     page.set_viewport_size({"width": 420, "height": 900})
-    page.wait_for_function("document.querySelector('#robot1').getBoundingClientRect().left < 30")
+    page.wait_for_function("document.querySelector('#robot0 .plot').getBoundingClientRect().width > 350")
+    assert page.evaluate(beside)
     assert page.evaluate("document.documentElement.scrollWidth") <= 420  # nothing sticks out
     picture(page, "narrow", tmp_path)

@@ -18,6 +18,7 @@ from rcdsac_trl.playground.play_drive import Drive
 from rcdsac_trl.playground.play_session import offers_of
 from rcdsac_trl.playground.scene_choice import SceneChoice
 from rcdsac_trl.world.maps.shapes import Box, Map
+from rcdsac_trl.world.office.building import make_office
 from robots import agent
 
 STEPS = 25
@@ -36,6 +37,21 @@ def way(scene: Drive, number: int = 0) -> list[tuple[float, float, float]]:
 
 
 # ------------------------------------------------------------------------------------------------ who drives
+@pytest.mark.parametrize(
+    ("agent", "low", "high"),
+    [
+        ("rcdsac_cvar-narrow", "careful", "neutral"),
+        ("rcdsac_pow-narrow", "careful", "neutral"),
+        ("rcwr-narrow", "bold", "careful"),
+    ],
+)
+def test_a_dial_says_what_its_ends_make_of_who_drives(agent: str, low: str, high: str) -> None:
+    dial = AgentDriver(offers().weights(agent)).dial
+    assert dial is not None
+    assert dial.words == (low, high)
+    assert (dial.word(dial.low), dial.word(dial.default), dial.word(dial.high)) == (low, "", high)
+
+
 @pytest.mark.parametrize("name", offers().drivers)
 def test_everything_that_is_offered_drives(name: str) -> None:
     with driven(agent=name) as scene:
@@ -110,6 +126,19 @@ def test_the_office_is_driven_by_cameras() -> None:
             assert robot.arena.scene().map.layout == "office"
             assert way(scene)[-1][0] > way(scene)[0][0]
         assert scene.robots[0].arena.situation().sectors.covered.sum() < 180
+
+
+def test_the_office_shows_all_of_the_way_and_a_goal_where_it_was_clicked() -> None:
+    with driven(1, agent="rcdsac_cvar-narrow", map="office") as scene:
+        (robot,) = scene.robots
+        office = make_office()
+        shown = robot.arena.scene().waypoints
+        assert shown[2:].tolist() == office.course[3:].tolist()  # the first two are where the robot takes them to be
+        assert shown[:2] == pytest.approx(office.course[1:3], abs=0.5)
+        scene.set_goal(12.7, 7.4)
+        assert robot.arena.scene().waypoints[-1] == pytest.approx([12.7, 7.4], abs=0.2)
+        assert {robot.arena.map.boxes.index(pane) for pane in robot.arena.glass}
+        assert len(robot.arena.glass) == sum(piece.glass for piece in office.pieces)
 
 
 def test_an_exported_agent_that_remembers_drives_by_the_name_of_its_folder(tmp_path: Any) -> None:

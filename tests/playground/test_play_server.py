@@ -1,5 +1,6 @@
 """The server without a browser: who may connect, what may be fetched, how many may drive, and what is refused."""
 
+import gc
 import os
 import re
 import signal
@@ -8,13 +9,15 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+import weakref
+from asyncio import sleep
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from bokeh.document.models import DocumentModelManager
 from scenes_to_play import offers
-from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
@@ -131,11 +134,47 @@ def test_a_bad_link_gets_a_sentence_before_a_page_is_made(
     assert not server._server.get_sessions()
 
 
+def test_a_closed_tab_ends_its_page_and_one_that_loads_slowly_keeps_its_own(tmp_path: Path) -> None:
+    server = PlayServer(offers(), host="localhost", port=0, max_sessions=2, films=tmp_path)
+    server.start()
+    for seed in (0, 1):
+        _get(server, f"/?agent=dwa&paused=on&seed={seed}")
+    shown, loading = server._pages
+    shown._begin()  # and no browser is connected any more
+    for _ in range(100):
+        IOLoop.current().run_sync(lambda: sleep(0.1))
+        if shown not in server._pages:
+            break
+    assert server._pages == [loading]
+    server.stop()
+
+
 def test_one_page_too_many_gets_a_sentence(server: PlayServer) -> None:
     assert "static/js/bokeh.min.js" in _get(server, "/")
     status, told = _refused(server, "/")
     assert status == 503
     assert told.startswith("max_sessions=1, and so many pages drive already")
+
+
+def test_a_name_is_known_however_it_is_spelt(server: PlayServer) -> None:
+    assert "static/js/bokeh.min.js" in _get(server, "/", f"LocalHost:{server.port}")
+
+
+@pytest.mark.parametrize("path", ["/play", "/autoload.js?bokeh-autoload-element=x", "/metadata", "//", "/films/a/b"])
+def test_where_nothing_is_a_sentence_says_so(server: PlayServer, path: str) -> None:
+    status, told = _refused(server, path)
+    assert status == 404
+    assert told == f"there is no {path.partition('?')[0]} here: the page is at /"
+    assert not server._server.get_sessions()
+
+
+def test_no_browser_keeps_a_page_for_another_tab(server: PlayServer) -> None:
+    async def fetched(path: str) -> str | None:
+        answer = await AsyncHTTPClient().fetch(f"{server.address}{path}")
+        return answer.headers.get("Cache-Control")
+
+    assert IOLoop.current().run_sync(lambda: fetched("")) == "no-store"
+    assert IOLoop.current().run_sync(lambda: fetched("static/js/bokeh.min.js")) != "no-store"
 
 
 @pytest.mark.parametrize("path", ["/", "/films/play-1.gif", "/static/js/bokeh.min.js"])
@@ -206,6 +245,28 @@ def test_without_the_package_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(UserInputError, match=r"pip install 'rcdsac-trl\[play\]'"):
         read_config(compose("play", []), PlaySettings)
+
+
+def test_no_ctrl_c_is_lost_to_what_collects_garbage(tmp_path: Path) -> None:
+    class Garbage:
+        pass
+
+    def collect() -> None:
+        garbage = Garbage()
+        last_words = weakref.ref(garbage, lambda ref: signal.raise_signal(signal.SIGINT))
+        del garbage
+        assert last_words() is None
+
+    server = PlayServer(offers(), host="localhost", port=0, max_sessions=1, films=tmp_path)
+    loop = IOLoop.current()
+    loop.call_later(0.1, collect)
+    over = loop.call_later(60.0, loop.stop)  # else it would serve for good
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            server.run(browser=False)
+    finally:
+        loop.remove_timeout(over)
+        gc.unfreeze()
 
 
 def test_the_program_says_where_it_is_and_ends_with_ctrl_c(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The worlds that the page shows: a map with goals as in training, and the office with its course."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -18,7 +19,7 @@ from rcdsac_trl.robot.observation import distance_and_bearing
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.map_source import MapSource
-from rcdsac_trl.world.maps.shapes import Map
+from rcdsac_trl.world.maps.shapes import Box, Map
 from rcdsac_trl.world.office.building import Office
 from rcdsac_trl.world.office.depth_cameras import Lens
 from rcdsac_trl.world.render import Scene
@@ -60,6 +61,8 @@ class Arena(Protocol):
     """A world with one robot in it, from its start."""
 
     map: Map
+    glass: Sequence[Box]
+    """Of the map, what its sensor does not see."""
     robot: RobotSettings
     period_s: float
 
@@ -145,6 +148,8 @@ class MapArena:
         period_s: control period.
     """
 
+    glass: Sequence[Box] = ()
+
     def __init__(self, source: MapSource, seed: int, robot: RobotSettings, sensor: str, memory_s: float) -> None:
         self.robot = robot
         self._covered = robot.lidar.mask
@@ -216,6 +221,7 @@ class CourseArena:
 
     Attributes:
         map: what stands.
+        glass: walls of it that cameras do not see.
         period_s: control period, on average.
     """
 
@@ -224,6 +230,8 @@ class CourseArena:
 
     def __init__(self, office: Office, config: Any, seed: int) -> None:
         self.map = office.map
+        panes = (piece.footprint for piece in office.pieces if piece.glass)
+        self.glass: Sequence[Box] = [pane for pane in panes if isinstance(pane, Box)]
         self._office, self._config = office, config
         conditions = Conditions(Lens(), OdometrySettings(), math.inf, seed)
         self._world = CourseWorld(
@@ -272,11 +280,12 @@ class CourseArena:
         return Outcome(None, moved.in_contact, self._look(), moved.v_c)
 
     def scene(self) -> Scene:
-        """Return what a picture of this moment shows; waypoints are where the robot takes them to be."""
+        """Return what a picture of this moment shows; the next two waypoints are where the robot takes them to be."""
         simulation = self.simulation
         x, y, yaw = simulation.pose
         cos, sin = math.cos(yaw), math.sin(yaw)
-        waypoints = self._waypoints @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+        next_two = self._waypoints @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+        waypoints = np.concatenate([next_two, self._world.follower.ahead[2:]])
         return Scene(
             map=self.map,
             pose=simulation.pose,

@@ -34,9 +34,10 @@ class Controls:
     Args:
         offers: what can be chosen.
         visitor: is told what is done with them, but for what the page does by itself.
+        zoomed: whether it begins with what is around each robot.
         save: makes a film.
         restyle: gives the page the theme of a name.
-        zoom: shows what is around the robot, or all of the map.
+        zoom: shows what is around each robot, or all of the map.
 
     Attributes:
         betas: the sliders.
@@ -48,6 +49,7 @@ class Controls:
         self,
         offers: Offers,
         visitor: Visitor,
+        zoomed: bool,
         *,
         save: Callable[[], None],
         restyle: Callable[[str], None],
@@ -76,7 +78,7 @@ class Controls:
         self._hear(speed, "active", visitor.choose_speed)
         self._stop = self._made(Toggle, "stop", label="stop zone", active=False)
         self._hear(self._stop, "active", visitor.switch_stop_zone)
-        self._zoom = self._made(Toggle, "follow", label="zoom in", active=False)
+        self._zoom = self._made(Toggle, "follow", label="zoom in", active=zoomed)
         self._hear(self._zoom, "active", lambda on: zoom())
         self.theme: Toggle = self._made(Toggle, "theme", label="◐", active=False)
         self._hear(self.theme, "active", lambda dark: restyle("dark" if dark else "light"))
@@ -104,7 +106,7 @@ class Controls:
 
     @property
     def zoomed(self) -> bool:
-        """Whether what is around the robot is shown, not all of the map."""
+        """Whether what is around each robot is shown, not all of the map."""
         return bool(self._zoom.active)
 
     def _made_fields(self, offers: Offers) -> dict[str, Select | Spinner]:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, LinearAxis, LinearColorMapper, Plot, Range1d
+from bokeh.models import BasicTicker, ColorBar, ColumnDataSource, LinearAxis, LinearColorMapper, Plot, Range1d
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
@@ -13,8 +13,9 @@ from rcdsac_trl.playground.view_state import ReturnView, RobotView, ValueView
 Colors = Mapping[str, str]
 
 _STEP = 5.0
-_HEAVIEST = 4.0
+_HEAVY = 4.0
 _BAR_PX = 54
+_ROOM = 0.05
 
 
 class ReturnFigure:
@@ -33,15 +34,16 @@ class ReturnFigure:
             y_range=self._range,
             tools="",
             toolbar_location=None,
-            x_axis_label="fraction of the return",
-            y_axis_label="return, higher is better",
-            title="what it expects of what it does",
+            x_axis_label="fraction of what may come",
+            y_axis_label="return",
+            title="the return it expects, worst to best",
             min_border=2,
             output_backend="canvas",
         )
-        plot.extra_y_ranges = {"weight": Range1d(0.0, _HEAVIEST)}
-        self._weight_axis = LinearAxis(y_range_name="weight", axis_label="weight of β", ticker=[0, 1, 2, 3, 4])
-        plot.add_layout(self._weight_axis, "right")
+        self._weight_range = Range1d(0.0, _HEAVY)
+        plot.extra_y_ranges = {"weight": self._weight_range}
+        weights = BasicTicker(desired_num_ticks=4, num_minor_ticks=0)
+        plot.add_layout(LinearAxis(y_range_name="weight", axis_label="weight", ticker=weights), "right")
         self._curve = ColumnDataSource(data={"x": [], "quantile": [], "weight": [], "width": []})
         self._levels = ColumnDataSource(data={"y": [], "color": [], "dash": []})
         self._bars = plot.vbar(
@@ -74,7 +76,7 @@ class ReturnFigure:
         self._curve.data = {
             "x": returns.fractions,
             "quantile": returns.quantiles,
-            "weight": np.minimum(returns.weights, _HEAVIEST),
+            "weight": returns.weights,
             "width": np.full(len(returns.fractions), 0.92 / len(returns.fractions)),
         }
         self._levels.data = {
@@ -83,6 +85,7 @@ class ReturnFigure:
             "dash": ["dotted", "dashed"],
         }
         self._fit(float(returns.quantiles[0]), float(returns.quantiles[-1]))
+        self._weight_range.end = max(_HEAVY, 2.0 ** math.ceil(math.log2(returns.weights.max())))
 
     def _fit(self, low: float, high: float) -> None:
         """Widen the axis when the curve leaves it; narrow it only when most of it is empty, so that it rests."""
@@ -153,8 +156,9 @@ class ValueFigure:
             self._image.data = {key: [] for key in self._image.data}
             return
         (x, x_end), (y, y_end) = values.speeds_m_per_s, values.turns_deg_per_s
-        self.figure.x_range.update(start=x, end=x_end)
-        self.figure.y_range.update(start=y, end=y_end)
+        for range_, low, high in ((self.figure.x_range, x, x_end), (self.figure.y_range, y, y_end)):
+            room = _ROOM * (high - low)  # for a star at the edge, where it is most of the time
+            range_.update(start=low - room, end=high + room)
         self._image.data = {
             "image": [values.values.astype(np.float32)],
             "x": [x],

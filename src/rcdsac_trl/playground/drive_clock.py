@@ -14,7 +14,7 @@ from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.play_drive import Drive, Robot
 from rcdsac_trl.playground.scene_choice import SceneChoice
 from rcdsac_trl.playground.view_state import RobotView, ValueView, robot_view, value_view
-from rcdsac_trl.world.maps.shapes import Map
+from rcdsac_trl.world.maps.shapes import Box, Map
 from rcdsac_trl.world.render import Scene
 
 SPEEDS = (0.5, 1.0, 2.0, 4.0)
@@ -41,6 +41,7 @@ class View:
         choice: the scene, as a link says it.
         num_orders: so many were carried out, or refused.
         map: what stands.
+        glass: of it, what cameras do not see.
         robots: one or two.
         running: whether it drives.
         speed: how many times as fast as real.
@@ -53,6 +54,7 @@ class View:
     choice: SceneChoice
     num_orders: int
     map: Map
+    glass: Sequence[Box]
     robots: tuple[RobotView, ...]
     running: bool
     speed: float
@@ -172,40 +174,39 @@ class DriveClock:
             self.refused = f"the drive has failed ({type(error).__name__}): see where the server was started"
 
     def _run(self) -> None:
-        while self._serve():
+        while (orders := self._next_orders()) is not None:
+            if orders:
+                self._carry_out(orders)
+            # Also where orders never end, as while a slider is drawn: a step that is due is not put off.
             if self._running and time.monotonic() >= self._due_s:
                 self._step()
                 self._schedule()
 
-    def _serve(self) -> bool:
-        """Carry out orders until a step is due; return whether to go on."""
-        while True:
-            orders = self._next_orders()
-            if not orders:
-                return True
-            self._message = None
-            for order in orders:
-                if order is None:
-                    return False
-                try:
-                    order()
-                except UserInputError as error:
-                    self._message = str(error)
-            self._num_done += len(orders)
-            self._values_s = 0.0  # beta may be another one
-            self._publish()
+    def _carry_out(self, orders: Sequence[Callable[[], None]]) -> None:
+        """Carry out some orders, and show what came of all of them."""
+        self._message = None
+        for order in orders:
+            try:
+                order()
+            except UserInputError as error:
+                self._message = str(error)
+        self._num_done += len(orders)
+        self._values_s = 0.0  # beta may be another one
+        self._publish()
 
-    def _next_orders(self) -> list[Callable[[], None] | None]:
-        """Return all orders that came, at least one unless a step is due first."""
+    def _next_orders(self) -> list[Callable[[], None]] | None:
+        """Return the orders that came, at least one unless a step is due first; None: it is to end."""
         wait_s = max(0.0, self._due_s - time.monotonic()) if self._running else None
+        orders: list[Callable[[], None]] = []
         try:
-            orders = [self._orders.get(timeout=wait_s)]
+            order = self._orders.get(timeout=wait_s)
+            # A slider that is drawn orders faster than views are computed: one view shows what came of all.
+            while order is not None:
+                orders.append(order)
+                order = self._orders.get_nowait()
         except queue.Empty:
-            return []
-        # A slider that is drawn orders faster than views are computed: one view shows what came of all.
-        while not self._orders.empty():
-            orders.append(self._orders.get())
-        return orders
+            return orders
+        return None
 
     def _schedule(self) -> None:
         now_s = time.monotonic()
@@ -276,6 +277,7 @@ class DriveClock:
             choice=drive.choice,
             num_orders=self._num_done,
             map=drive.robots[0].arena.map,
+            glass=drive.robots[0].arena.glass,
             robots=views,
             running=self._running,
             speed=self._speed,

@@ -17,6 +17,8 @@ from rcdsac_trl.seeding import stream
 
 NUM_QUANTILES = 16
 """At so many fractions the page shows the return."""
+# Up to this share of its range a dial is near its low end, and from that on near its high one.
+_NEAR_LOW, _NEAR_HIGH = 0.3, 0.95
 
 
 @dataclass(frozen=True)
@@ -45,12 +47,25 @@ class Dial:
         low: its smallest value, for beta the most averse one.
         high: its largest.
         default: where it stands unless somebody turns it.
+        words: what a driver is at either end.
     """
 
     symbol: str
     low: float
     high: float
     default: float
+    words: tuple[str, str]
+
+    def word(self, value: float) -> str:
+        """Return what a driver is with a value that is near an end; else nothing.
+
+        Example:
+            >>> dial = Dial("β", -2.0, 0.0, -1.0, ("careful", "neutral"))
+            >>> dial.word(-1.5), dial.word(-1.0), dial.word(0.0)
+            ('careful', '', 'neutral')
+        """
+        share = (value - self.low) / (self.high - self.low)
+        return self.words[0] if share <= _NEAR_LOW else self.words[1] if share >= _NEAR_HIGH else ""
 
     def check(self, key: str, value: float | None) -> float:
         """Return a value that may be dialled; None: the default.
@@ -121,7 +136,14 @@ class AgentDriver:
         if config.context is not None and config.context_range is not None:
             low, high = config.context_range
             symbol = "β" if config.context == "beta" else "w"
-            self.dial = Dial(symbol, low, high, (low + high) / 2.0)
+            self.dial = Dial(symbol, low, high, (low + high) / 2.0, self._words(high))
+
+    def _words(self, high: float) -> tuple[str, str]:
+        """Return what it is at the ends of its range, of which one is the highest value."""
+        if self.policy.config.context == "collision_weight":
+            return "bold", "careful"
+        is_neutral = self.measure is not None and high == self.measure.neutral_beta
+        return "careful", "neutral" if is_neutral else "bold"
 
     @property
     def guarded(self) -> bool:

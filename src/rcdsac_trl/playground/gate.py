@@ -1,5 +1,6 @@
 """The gate before the pages: whose browser may come in, and a sentence for who may not, before a page is made."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from http.client import responses
@@ -12,12 +13,16 @@ from tornado.routing import AnyMatches, Matcher, Router, Rule, RuleRouter
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.palette import style_sheet
+from rcdsac_trl.playground.scene_choice import shortened
 
 _HERE = Path(__file__).parent
-_BAD_LINK, _UNKNOWN_NAME, _FULL = 400, 403, 503
-_WAYS_ON = {_BAD_LINK: '<a href="/">Open the usual scene.</a>', _FULL: '<a href="">Try again.</a>', _UNKNOWN_NAME: ""}
+_BAD_LINK, _UNKNOWN_NAME, _NOWHERE, _FULL = 400, 403, 404, 503
+_USUAL = '<a href="/">Open the usual scene.</a>'
+_WAYS_ON = {_BAD_LINK: _USUAL, _NOWHERE: _USUAL, _FULL: '<a href="">Try again.</a>', _UNKNOWN_NAME: ""}
 # A page that found no room asks again by itself, s.
 _AGAIN_S = 5
+# All that there is: the page, what Bokeh's pages ask for, and films.
+_PLACES = re.compile(r"/|/ws|/static/.*|/films/[^/]+")
 # What a browser leaves out of the name that it asks.
 _USUAL_PORTS = (80, 443)
 
@@ -50,11 +55,13 @@ class _Refused(Matcher):
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
         """Return status and sentence of a request that is refused; None for others."""
-        name = request.host
+        name = request.host.lower()
         if name not in self._known and not any(f"{name}:{port}" in self._known for port in _USUAL_PORTS):
             shown = name if ":" in name else f"{name}:{_USUAL_PORTS[0]}"
             sentence = f"this server is not known as {shown}: start it with origins=[{shown}], or use {self._known[0]}"
             return {"status": _UNKNOWN_NAME, "sentence": sentence}
+        if not _PLACES.fullmatch(request.path):
+            return {"status": _NOWHERE, "sentence": f"there is no {shortened(request.path)} here: the page is at /"}
         if request.path != "/" or request.method != "GET":
             return None
         try:

@@ -1,6 +1,6 @@
 """The map from above, as a Bokeh figure: what stands is drawn once, what moves is copied from each view."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d, ScaleBar
@@ -10,7 +10,7 @@ from bokeh.plotting import figure
 from rcdsac_trl.playground.palette import trail_shades
 from rcdsac_trl.playground.view_state import RobotView
 from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY
-from rcdsac_trl.world.maps.shapes import Map
+from rcdsac_trl.world.maps.shapes import Box, Map
 
 Colors = Mapping[str, str]
 
@@ -18,7 +18,8 @@ _MARGIN = 0.02
 _FOLLOWED_M = 4.5
 _GOAL_RADII_M = (0.34, 0.15)
 _WAYPOINT_RADIUS_M = 0.11
-_CONTACT_RADIUS_M = 0.22
+# What has to be found on a map of any size has so many pixels: a place of contact, and what surrounds the robot.
+_CONTACT_PX, _HALO_PX = 13, 30
 _REMEMBERED_RADIUS_M = 0.05
 _ENDS = ("x0", "y0", "x1", "y1")
 # What is drawn, from the ground up, each with one glyph, and its columns.
@@ -29,32 +30,15 @@ _COLUMNS = {
     "trail": (*_ENDS, "speed"),
     "lines": (*_ENDS, "color", "width", "dash"),
     "discs": ("x", "y", "radius", "fill", "alpha", "line"),
+    "marks": ("x", "y", "size", "color", "alpha"),
     "body": ("xs", "ys", "fill", "line"),
 }
-
-
-class MapRanges:
-    """The part of the map that is shown, the same in all figures that are given it."""
-
-    def __init__(self) -> None:
-        self.x, self.y = Range1d(0.0, 1.0), Range1d(0.0, 1.0)
-
-    def show(self, map_: Map, around: tuple[float, float] | None) -> None:
-        """Show the whole map, or what is around a place."""
-        if around is None:
-            margin = _MARGIN * map_.size_m
-            ends = [(-margin, map_.size_m + margin)] * 2
-        else:
-            ends = [(middle - _FOLLOWED_M, middle + _FOLLOWED_M) for middle in around]
-        for range_, (low, high) in zip((self.x, self.y), ends, strict=True):
-            range_.update(start=low, end=high, reset_start=low, reset_end=high)
 
 
 class MapFigure:
     """One robot's world.
 
     Args:
-        ranges: what is shown.
         obstacles: x, y and radius of those that were put, shared by all figures: they can be dragged.
         name: of the figure's root.
 
@@ -62,12 +46,11 @@ class MapFigure:
         figure: the Bokeh model.
     """
 
-    def __init__(self, ranges: MapRanges, obstacles: ColumnDataSource, name: str) -> None:
-        self._ranges = ranges
+    def __init__(self, obstacles: ColumnDataSource, name: str) -> None:
         self.figure = plot = figure(
             name=name,
-            x_range=ranges.x,
-            y_range=ranges.y,
+            x_range=Range1d(0.0, 1.0),
+            y_range=Range1d(0.0, 1.0),
             sizing_mode="stretch_both",
             tools=[PanTool(), WheelZoomTool(), ResetTool()],
             toolbar_location="above",
@@ -127,6 +110,15 @@ class MapFigure:
             line_color="line",
             line_width=1.5,
         )
+        plot.scatter(
+            "x",
+            "y",
+            size="size",
+            source=self._sources["marks"],
+            fill_color="color",
+            fill_alpha="alpha",
+            line_color=None,
+        )
         plot.patches("xs", "ys", source=self._sources["body"], fill_color="fill", line_color="line", line_width=1.5)
         drag = PointDrawTool(renderers=[held], add=False, drag=True)
         plot.add_tools(drag)
@@ -140,14 +132,13 @@ class MapFigure:
 
     def restyle(self, colors: Colors) -> None:
         """Take another theme's colours, but for what is copied."""
-        self.figure.background_fill_color = colors["floor"]
-        self.figure.border_fill_color = colors["outside"]
+        self.figure.background_fill_color = self.figure.border_fill_color = colors["outside"]
         self._speeds.palette = trail_shades(colors)
         # A new one: a browser draws it once.
         if self._scale_bar is not None:
             self.figure.center.remove(self._scale_bar)
         self._scale_bar = ScaleBar(
-            range=self._ranges.x,
+            range=self.figure.x_range,
             unit="m",
             orientation="horizontal",
             location="bottom_left",
@@ -155,22 +146,42 @@ class MapFigure:
             bar_line_width=2,
             bar_line_color=colors["ink"],
             label_text_color=colors["ink"],
+            label_text_font_size="11px",
             label_standoff=2,
-            background_fill_alpha=0.0,
+            background_fill_color=colors["floor"],
+            background_fill_alpha=0.6,
             border_line_color=None,
-            padding=4,
-            margin=14,
+            padding=2,
+            margin=8,
         )
         self.figure.add_layout(self._scale_bar)
 
-    def draw_map(self, map_: Map, colors: Colors) -> None:
-        """Draw what stands, and begin the trail anew."""
+    def look(self, map_: Map, around: tuple[float, float] | None) -> None:
+        """Show the whole map, or what is around a place."""
+        if around is None:
+            margin = _MARGIN * map_.size_m
+            ends = [(-margin, map_.size_m + margin)] * 2
+        else:
+            ends = [(middle - _FOLLOWED_M, middle + _FOLLOWED_M) for middle in around]
+        for range_, (low, high) in zip((self.figure.x_range, self.figure.y_range), ends, strict=True):
+            range_.update(start=low, end=high, reset_start=low, reset_end=high)
+
+    def draw_map(self, map_: Map, glass: Sequence[Box], colors: Colors) -> None:
+        """Draw what stands, and begin the trail anew.
+
+        Args:
+            map_: likewise.
+            glass: boxes of the map that cameras do not see.
+            colors: of the theme.
+        """
         boxes = sorted(map_.boxes, key=lambda box: box.wall)
-        corners = [box.corners() for box in boxes]
+        size_m = map_.size_m
+        floor = np.array([(0.0, 0.0), (size_m, 0.0), (size_m, size_m), (0.0, size_m)])
+        corners = [floor, *(box.corners() for box in boxes)]
         self._sources["static"].data = {
             "xs": [corner[:, 0] for corner in corners],
             "ys": [corner[:, 1] for corner in corners],
-            "fill": [colors["wall"] if box.wall else _clutter(box.mapped, colors) for box in boxes],
+            "fill": [colors["floor"], *(colors["glass"] if box in glass else _box_color(box, colors) for box in boxes)],
         }
         self._sources["round"].data = {
             "x": [piece.x for piece in map_.cylinders],
@@ -199,6 +210,7 @@ class MapFigure:
             "dash": ["solid"] * len(sensor.hits) + ["dashed"] * len(way),
         }
         self._sources["discs"].data = _discs(view, colors)
+        self._sources["marks"].data = _marks(view, colors)
         self._sources["body"].data = {
             "xs": [view.body[:, 0], view.arrow[:, 0]],
             "ys": [view.body[:, 1], view.arrow[:, 1]],
@@ -228,6 +240,10 @@ TRAIL_PIECES = 400
 """Pieces of the trail that a browser keeps."""
 
 
+def _box_color(box: Box, colors: Colors) -> str:
+    return colors["wall"] if box.wall else _clutter(box.mapped, colors)
+
+
 def _clutter(mapped: bool, colors: Colors) -> str:
     return colors["mapped" if mapped else "unmapped"]
 
@@ -235,8 +251,6 @@ def _clutter(mapped: bool, colors: Colors) -> str:
 def _discs(view: RobotView, colors: Colors) -> dict[str, list]:
     """Return all round things that move or mark a place: x, y, radius, colours."""
     rows: list[tuple[float, float, float, str, float, str]] = []
-    for x, y in view.contacts.tolist():
-        rows.append((x, y, _CONTACT_RADIUS_M, colors["touching"], 0.35, colors["touching"]))
     for x, y in view.way[1:-1].tolist():
         rows.append((x, y, _WAYPOINT_RADIUS_M, colors["floor"], 1.0, colors["way"]))
     x, y = view.way[-1].tolist()
@@ -244,10 +258,18 @@ def _discs(view: RobotView, colors: Colors) -> dict[str, list]:
         (x, y, radius, colors["goal"], alpha, colors["goal"])
         for radius, alpha in zip(_GOAL_RADII_M, (0.2, 1.0), strict=True)
     ]
-    for x, y, radius in view.movers.tolist():
-        rows.append((x, y, radius, colors["mover"], 1.0, colors["mover"]))
     for x, y in view.remembered.tolist():
         rows.append((x, y, _REMEMBERED_RADIUS_M, colors["remembered"], 0.7, colors["remembered"]))
+    for x, y, radius in view.movers.tolist():
+        rows.append((x, y, radius, colors["mover"], 1.0, colors["mover"]))
     for x, y, radius in view.expected.tolist():
         rows.append((x, y, radius, colors["remembered"], 0.0, colors["remembered"]))
     return {key: list(column) for key, column in zip(_COLUMNS["discs"], zip(*rows, strict=True), strict=True)}
+
+
+def _marks(view: RobotView, colors: Colors) -> dict[str, list]:
+    """Return what marks places where contacts began, and where the robot is: x, y, px, colour."""
+    x, y, _ = view.pose
+    halo = (x, y, _HALO_PX, colors["touching" if view.in_contact else "robot"], 0.28)
+    rows = [(*place, _CONTACT_PX, colors["touching"], 0.6) for place in view.contacts.tolist()] + [halo]
+    return {key: list(column) for key, column in zip(_COLUMNS["marks"], zip(*rows, strict=True), strict=True)}

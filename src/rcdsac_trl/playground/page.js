@@ -5,6 +5,7 @@ const put = (element, text) => { if (element && element.textContent !== text) el
 
 document.documentElement.dataset.theme = state.theme;
 document.body.classList.toggle("two", state.robots.length === 2);
+document.body.classList.toggle("glazed", state.glass);
 const message = document.getElementById("message");
 put(message, state.message);
 message.classList.toggle("waits", state.waits);
@@ -27,6 +28,7 @@ state.robots.forEach((robot, number) => {
   section.classList.toggle("blind", robot.blind);
   section.classList.toggle("deaf", robot.deaf);
   section.querySelector(".alarm").classList.toggle("hit", robot.touching);
+  document.querySelectorAll(".beta")[number].querySelectorAll("span").forEach((end, at) => put(end, robot.ends[at]));
 });
 const film = document.getElementById("film");
 if (film.dataset.shown !== JSON.stringify(state.film)) {
@@ -40,8 +42,10 @@ if (film.dataset.shown !== JSON.stringify(state.film)) {
     film.append(" ", link);
   }
 }
-if (!state.refused && window.location.search !== "?" + state.query)
-  window.history.replaceState(null, "", "?" + state.query);
+const asked = new URLSearchParams(window.location.search);
+const kept = ["theme", "zoom"].filter((key) => asked.has(key)).map((key) => "&" + key + "=" + asked.get(key));
+const query = "?" + state.query + kept.join("");
+if (!state.refused && window.location.search !== query) window.history.replaceState(null, "", query);
 
 if (window.playKeys === undefined) {
   // Else who holds an obstacle for a moment, or has a slow machine, could not drag it: it would be a press.

@@ -1,17 +1,19 @@
 """A page's link, read and checked before anything of the page is made."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.cast import cast
 from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.palette import THEMES
-from rcdsac_trl.playground.scene_choice import SceneChoice, shortened
+from rcdsac_trl.playground.scene_choice import NOBODY, SceneChoice, shortened
 
 _CAREFUL = 0.25
+_EVENTFUL = "hard"
 # What a link may say of the page itself.
-_OWN_KEYS: Mapping[str, tuple[str, ...]] = {"theme": THEMES, "paused": ("on", "off")}
+_SWITCH = ("on", "off")
+_OWN_KEYS: Mapping[str, tuple[str, ...]] = {"theme": THEMES, "paused": _SWITCH, "zoom": _SWITCH}
 
 
 @dataclass(frozen=True)
@@ -22,18 +24,20 @@ class PageLink:
         choice: the scene.
         theme: one of :data:`~rcdsac_trl.playground.palette.THEMES`; None: as the browser has it.
         running: whether it drives at once.
+        zoomed: whether it begins with what is around each robot, which on half a page is small otherwise.
     """
 
     choice: SceneChoice
     theme: str | None
     running: bool
+    zoomed: bool
 
 
 def read_link(query: Mapping[str, str], offers: Offers) -> PageLink:
     """Read a link's query.
 
     Args:
-        query: by key: those of a scene, ``theme`` and ``paused``.
+        query: by key: those of a scene, ``theme``, ``paused`` and ``zoom``.
         offers: what can be chosen.
 
     Raises:
@@ -46,18 +50,20 @@ def read_link(query: Mapping[str, str], offers: Offers) -> PageLink:
     scene = {key: value for key, value in query.items() if key not in own}
     choice = SceneChoice.of_query(scene, next(iter(offers.agents))) if scene else usual_scene(offers)
     cast(choice, offers)
-    return PageLink(choice, own.get("theme"), own.get("paused") != "on")
+    zoom = own.get("zoom", "off" if choice.second == NOBODY else "on")
+    return PageLink(choice, own.get("theme"), running=own.get("paused") != "on", zoomed=zoom == "on")
 
 
 def usual_scene(offers: Offers) -> SceneChoice:
     """Return what is shown unless a link says it: the first agent twice, side by side, careful and as bold as can be.
 
-    Careful is a quarter above the lowest value that it was trained with: at the very end some agents hardly move.
+    Careful is a quarter above the lowest value that it was trained with: at the very end some agents hardly move. Where
+    much stands in the way, there is much to be careful of.
     """
-    alone = SceneChoice(next(iter(offers.agents)))
+    alone = SceneChoice(next(iter(offers.agents)), map=_EVENTFUL)
     (part,) = cast(alone, offers)
     dial = part.driver.dial
     if dial is None or part.driver.measure is None:  # without a measure, what is dialled is no beta
         return alone
     careful = round(dial.low + _CAREFUL * (dial.high - dial.low), 2)
-    return SceneChoice(part.name, careful, second=part.name, beta2=dial.high)
+    return replace(alone, beta=careful, second=part.name, beta2=dial.high)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rcdsac_trl.playground.drive_clock import View
-from rcdsac_trl.playground.scene_choice import NOBODY
+from rcdsac_trl.playground.scene_choice import NOBODY, SceneChoice
 from rcdsac_trl.playground.view_state import RobotView
 
 OPENING = "Making the scene .."
@@ -22,6 +22,7 @@ def refusal_words(theme: str, sentence: str) -> dict[str, Any]:
         "waits": False,
         "rate": "",
         "scene": "",
+        "glass": False,
         "query": "",
         "film": {"told": "", "files": []},
     }
@@ -40,7 +41,6 @@ def view_words(
         film: a sentence about the latest film, and the names of its files.
     """
     choice = view.choice
-    second = "" if choice.second == NOBODY else f" beside {choice.second}"
     return {
         "number": view.number,
         "theme": theme,
@@ -48,15 +48,28 @@ def view_words(
         "message": OPENING if opening else view.message or "",
         "waits": opening,
         "query": choice.query,
-        "scene": f"{choice.agent}{second}, {choice.map}, seed {choice.seed}",
-        "rate": f"{shown_per_s:.0f} agent steps/s shown, {view.steps_per_s:.0f} driven",
+        "scene": f"{_drivers(choice)}, {choice.map}, seed {choice.seed}",
+        "glass": bool(view.glass),
+        "rate": f"{shown_per_s:.0f} agent steps/s shown, {view.steps_per_s:.0f} driven" if view.running else "",
         "film": {"told": film[0], "files": list(film[1])},
         "robots": [_robot_words(robot) for robot in view.robots],
     }
 
 
+def _drivers(choice: SceneChoice) -> str:
+    if choice.second == NOBODY:
+        return choice.agent
+    return f"{choice.agent} twice" if choice.second == choice.agent else f"{choice.agent} beside {choice.second}"
+
+
+def _dial_words(robot: RobotView) -> dict[str, Any]:
+    dial, dialled = robot.dial, robot.dialled
+    if dial is None or dialled is None:
+        return {"beta": "", "word": "", "ends": ["", ""]}
+    return {"beta": f"{dial.symbol} = {dialled:.2f}", "word": dial.word(dialled), "ends": list(dial.words)}
+
+
 def _robot_words(robot: RobotView) -> dict[str, Any]:
-    beta = "" if robot.dial is None else f"{robot.dial.symbol} = {robot.dialled:.2f}"
     returns = robot.returns
     value = "" if returns is None else f"mean {returns.mean:.1f} (dotted), at this β {returns.value:.1f} (dashed)"
     nothing = ""
@@ -67,7 +80,7 @@ def _robot_words(robot: RobotView) -> dict[str, Any]:
     limited = "" if robot.limited is None else f"held by {robot.limited.removeprefix('limited by ').split(';')[0]}"
     return {
         "name": robot.name,
-        "beta": beta,
+        **_dial_words(robot),
         "limited": limited,
         "speed": f"{robot.speed_m_per_s + 0.0:.2f} m/s",
         "clearance": f"{robot.clearance_m:.2f} m",

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from bokeh.document import Document
-from bokeh.events import DocumentReady
+from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.models import CustomJS, Div
 
 from rcdsac_trl.playground.controls import Controls
 from rcdsac_trl.playground.drive_clock import DriveClock, View
 from rcdsac_trl.playground.offers import Offers
+from rcdsac_trl.playground.page_link import PageLink
 from rcdsac_trl.playground.page_words import OPENING, refusal_words, view_words
 from rcdsac_trl.playground.palette import style_sheet
 from rcdsac_trl.playground.play_film import FilmStudio
@@ -24,7 +25,9 @@ from rcdsac_trl.playground.stage import Stage
 from rcdsac_trl.playground.visitor import Visitor
 
 _HERE = Path(__file__).parent
-_TEMPLATE, _STYLE, _CODE = ((_HERE / f"page.{kind}").read_text("utf-8") for kind in ("html", "css", "js"))
+_TEMPLATE, _STYLE, _CODE, _LOST = (
+    (_HERE / name).read_text("utf-8") for name in ("page.html", "page.css", "page.js", "page_lost.js")
+)
 _TAKE_THEME = (
     "const dark = window.matchMedia('(prefers-color-scheme: dark)').matches;"
     "theme.active = asked ? asked === 'dark' : dark;"
@@ -43,19 +46,20 @@ class PlayPage:
     Args:
         document: that becomes the page.
         clock: the drive.
-        theme: light or dark; None: as the browser has it.
+        link: that it was opened with.
         offers: what can be chosen.
         studio: makes films.
 
     Attributes:
         document: likewise.
         begun: whether a browser has shown it.
+        made_s: when it was made, on the monotonic clock.
     """
 
     def __init__(
-        self, document: Document, clock: DriveClock, theme: str | None, offers: Offers, studio: FilmStudio
+        self, document: Document, clock: DriveClock, link: PageLink, offers: Offers, studio: FilmStudio
     ) -> None:
-        self.document, self.begun = document, False
+        self.document, self.begun, self.made_s = document, False, time.monotonic()
         self._clock, self._studio = clock, studio
         self._theme = "light"
         self._ended: str | None = None
@@ -67,9 +71,11 @@ class PlayPage:
         self._keys_heard = self._steps_drawn = 0
         self._visitor = visitor = Visitor(clock)
         self._stage = Stage(self._theme, visitor.tap, visitor.move_obstacle)
-        self._controls = Controls(offers, visitor, save=self._save, restyle=self._restyle, zoom=self._look_around)
+        self._controls = Controls(
+            offers, visitor, link.zoomed, save=self._save, restyle=self._restyle, zoom=self._look_around
+        )
         self._wire = Div(name="wire", text="", visible=False, tags=[])
-        self._compose(theme)
+        self._compose(link.theme)
 
     # ------------------------------------------------------------------------------------------- its life
     def _compose(self, theme: str | None) -> None:
@@ -85,6 +91,8 @@ class PlayPage:
         document.template_variables.update(palettes=style_sheet(), page_css=_STYLE, opening=OPENING)
         document.js_on_event(DocumentReady, CustomJS(args={"theme": switch, "asked": theme or ""}, code=_TAKE_THEME))
         document.on_event(DocumentReady, lambda event: self._begin())
+        document.config.update(reconnect_session=False, notify_connection_status=False)
+        document.js_on_event(ConnectionLost, CustomJS(code=_LOST))
         document.on_session_destroyed(lambda context: self.close())
 
     def _begin(self) -> None:

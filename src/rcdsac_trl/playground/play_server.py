@@ -4,6 +4,7 @@ import gc
 import queue
 import socket
 import threading
+import time
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,8 +19,9 @@ from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from bokeh.server.util import bind_sockets
 from tornado.httpserver import HTTPServer
-from tornado.ioloop import IOLoop
-from tornado.web import HTTPError, RequestHandler
+from tornado.httputil import HTTPHeaders
+from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.web import HTTPError, OutputTransform, RequestHandler
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.drive_clock import DriveClock
@@ -28,14 +30,20 @@ from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.page_link import PageLink, read_link
 from rcdsac_trl.playground.play_film import FilmStudio
 from rcdsac_trl.playground.play_page import PlayPage
+from rcdsac_trl.system.interrupts import at_safe_points, interruption_point
 from rcdsac_trl.system.listening import cannot_listen, check_can_listen
 
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 _ALL_ADDRESSES = ("0.0.0.0", "::")
-# A page that nobody looks at any more ends after this.
-_UNUSED_MS = 15_000
+# A page that no browser has shown ends after this: a slow one, or a slow way to it, takes its time. Where there is no
+# room, it gives its place away sooner.
+_UNUSED_MS = 120_000
+_WAITED_FOR_S = 15.0
+# So often it looks which pages nobody looks at any more.
 _CHECK_UNUSED_MS = 1000
 _LARGEST_MESSAGE_BYTES = 1_000_000
+# So often it looks whether Ctrl-C was pressed.
+_LISTEN_MS = 200
 _PATH = "/"
 
 
@@ -77,10 +85,12 @@ class PlayServer:
             unused_session_lifetime_milliseconds=_UNUSED_MS,
             check_unused_sessions_milliseconds=_CHECK_UNUSED_MS,
             websocket_max_message_size_bytes=_LARGEST_MESSAGE_BYTES,
+            transforms=[_NotKept],
         )
         self._http = HTTPServer(guarded(pages, known, self._check))
         self._http.add_sockets(sockets)
         self._server = BaseServer(IOLoop.current(), pages, self._http)
+        self._closed_tabs = PeriodicCallback(self._let_go, _CHECK_UNUSED_MS)
 
     @property
     def address(self) -> str:
@@ -95,6 +105,7 @@ class PlayServer:
     def start(self) -> None:
         """Answer whoever asks, while the thread's event loop runs."""
         self._server.start()
+        self._closed_tabs.start()
 
     def run(self, *, browser: bool) -> None:
         """Serve until Ctrl-C.
@@ -108,14 +119,20 @@ class PlayServer:
         gc.freeze()
         if browser:
             webbrowser.open(self.address)
+        # Python would lose a Ctrl-C that comes while garbage is collected, as it is for every page that ends.
+        listening = PeriodicCallback(interruption_point, _LISTEN_MS)
+        listening.start()
         try:
-            self._server.io_loop.start()
+            with at_safe_points():
+                self._server.io_loop.start()
         finally:
+            listening.stop()
             self.stop()
 
     def stop(self) -> None:
         """Answer no more, and end all drives."""
         self._http.stop()
+        self._closed_tabs.stop()
         for page in self._pages:
             page.close()
         self._server.stop(wait=False)
@@ -130,9 +147,16 @@ class PlayServer:
             return
         clock = DriveClock(link.choice, self._offers, running=link.running)
         self._clocks.add(clock)
-        page = PlayPage(document, clock, link.theme, self._offers, self._studio)
+        page = PlayPage(document, clock, link, self._offers, self._studio)
         self._pages.append(page)
         document.on_session_destroyed(lambda context: self._forget(page))
+
+    def _let_go(self) -> None:
+        """End pages that were shown and whose tab was closed."""
+        shown = [page.document for page in self._pages if page.begun]
+        for session in self._server.get_sessions(_PATH):
+            if not session.connection_count and session.document in shown:
+                session.request_expiration()
 
     def _forget(self, page: PlayPage) -> None:
         if page in self._pages:
@@ -148,7 +172,9 @@ class PlayServer:
         if len(self._pages) < self._max_sessions:
             return link
         watched = [session.document for session in self._server.get_sessions(_PATH) if session.connection_count]
-        for page in [page for page in self._pages if page.begun and page.document not in watched]:
+        now_s = time.monotonic()
+        waited_for = [page.document for page in self._pages if not page.begun and now_s - page.made_s < _WAITED_FOR_S]
+        for page in [page for page in self._pages if page.document not in [*watched, *waited_for]]:
             page.close("this page was out of reach for a moment, and another one took its place: open it again")
             self._forget(page)
         if len(self._pages) >= self._max_sessions:
@@ -175,7 +201,7 @@ def in_thread(make: Callable[[], PlayServer]) -> Iterator[PlayServer]:
         loop = IOLoop(make_current=False)
         loop.add_callback(begin, loop)
         loop.start()
-        loop.close()
+        loop.close(all_fds=True)  # so that open pages notice
 
     def begin(loop: IOLoop) -> None:
         try:
@@ -199,6 +225,21 @@ def in_thread(make: Callable[[], PlayServer]) -> Iterator[PlayServer]:
         loop.add_callback(server.stop)
         loop.add_callback(loop.stop)
         thread.join()
+
+
+class _NotKept(OutputTransform):
+    """Keeps pages out of browsers' caches, from which they are taken when one goes back, or doubles a tab.
+
+    Each page is of one drive: from there it would be shared, or of a drive that has ended.
+    """
+
+    def transform_first_chunk(
+        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
+    ) -> tuple[int, HTTPHeaders, bytes]:
+        """Mark pages."""
+        if headers.get("Content-Type", "").startswith("text/html"):
+            headers["Cache-Control"] = "no-store"
+        return status_code, headers, chunk
 
 
 class _FilmHandler(RequestHandler):

@@ -115,6 +115,8 @@ class SceneChoice:
 def shortened(text: str) -> str:
     """Return what somebody wrote, as a sentence can bear it."""
     text = "".join(letter if letter.isprintable() else "?" for letter in text[: _LONGEST_VALUE + 1])
+    if not text:
+        return "''"
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}.."
 
 

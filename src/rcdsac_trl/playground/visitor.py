@@ -1,5 +1,6 @@
 """What a visitor does, as orders to the drive."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -51,7 +52,7 @@ class Visitor:
     def tap(self, event: Tap) -> None:
         """Send the robots somewhere, or put an obstacle there."""
         x, y = event.x, event.y
-        if x is None or y is None:
+        if x is None or y is None or not (math.isfinite(x) and math.isfinite(y)):
             return
         if event.modifiers is not None and event.modifiers["shift"]:
             self._tell(lambda drive: drive.put_obstacle(x, y))

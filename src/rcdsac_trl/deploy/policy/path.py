@@ -120,6 +120,11 @@ class PathFollower:
         return self._along_m
 
     @property
+    def ahead(self) -> NDArray[np.float64]:
+        """The corners of the path that are still to be reached, m, map frame, [k, 2]; the goal is the last one."""
+        return self._line.points[self._next :]
+
+    @property
     def _goal_m(self) -> float:
         return self._config.goal_radius_m
 

@@ -24,7 +24,7 @@ _QUALITY = "26"
 # A GIF stores every change of a pixel: fewer frames and pixels and few colours keep it to a few MB.
 _GIF_FPS = 3.0
 _GIF_WIDTH_PX = 960
-_GIF_COLORS = 64
+_GIF_COLORS = 128
 # Frames that the GIF's colours are taken from.
 _PALETTE_FRAMES = 12
 
