@@ -23,8 +23,8 @@ FORESEEN_ACTIONS: tuple[tuple[float, tuple[float, ...]], ...] = (
 full speed, half of it, standing, and backwards."""
 
 FORESEEN_SPAN_M = (0.02, 0.8)
-"""Gaps between the robot's inside and what it foresees, m: below the first all are alike, beyond the second none is near.
-"""
+"""Gaps between the robot's inside and what it foresees, m: below the first all are alike, beyond the second none is
+near."""
 
 NUM_LOOK_AHEAD = 2
 """Numbers that are told of an action: how near it leads soon, and later."""
@@ -89,7 +89,7 @@ def nearer(read: NDArray[np.float32], margin_m: float) -> NDArray[np.float32]:
         [0.07, 0.07]
     """
     told = read[..., -FORESEEN_SIZE:]
-    least_m, far_m = np.float32(FORESEEN_SPAN_M)
+    least_m, far_m = (np.float32(gap_m) for gap_m in FORESEEN_SPAN_M)
     gap_m = far_m * np.power(np.float32(10.0), -told) - np.float32(margin_m)
     moved = np.log10(far_m / np.maximum(gap_m, least_m))
     return np.concatenate((read[..., :-FORESEEN_SIZE], np.where(told > 0.0, moved, told)), axis=-1, dtype=np.float32)
