@@ -1,5 +1,7 @@
 """Real trainings that take about a second, for the tests of the pipeline."""
 
+import json
+import shutil
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +17,7 @@ from rcdsac_trl.config.compose import combinations, compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.deploy.policy.registry import find_weights
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.release.named_agent import named_agent
@@ -138,3 +141,16 @@ def first_combinations_only(monkeypatch: pytest.MonkeyPatch) -> None:
     module = import_module("rcdsac_trl.experiments.sweep_jobs")
     monkeypatch.setattr(module, "combinations", lambda overrides: combinations(overrides)[:1])
     monkeypatch.setattr(module, "compose", lambda name, overrides: _composed_once(name, tuple(overrides)))
+
+
+def agent_of_before(folder: Path) -> Path:
+    """Write a shipped agent as earlier versions exported theirs: it says no temperature, and restarts otherwise."""
+    shutil.copytree(find_weights("dsac_pow_-1-narrow"), folder)
+    config = json.loads((folder / "config.json").read_bytes())
+    del config["provenance"]["temperature"]
+    config["restart_steps"] = 2
+    (folder / "config.json").write_text(json.dumps(config))
+    trained = OmegaConf.load(folder / "training.yaml")
+    trained.network.restart_steps = 2
+    OmegaConf.save(trained, folder / "training.yaml")
+    return folder

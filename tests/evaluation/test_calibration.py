@@ -241,8 +241,8 @@ def test_what_cannot_be_calibrated_is_refused(tiny_run: Path, tmp_path: Path) ->
     # Of 3 states and in one process; a simulation takes 28 MB.
     with pytest.raises(UserInputError, match=r"3000000 simulations: 84000\.0 GB .* lower num_rollouts"):
         calibrate(tiny_run, "beta=[-1]", "num_states=3", "num_rollouts=1_000_000", "num_workers=0")
-    with pytest.raises(UserInputError, match=r"dsac_pow-narrow does not say at which temperature .* export the agent"):
-        calibrate(Path("dsac_pow-narrow"), "beta=[-1]")
+    with pytest.raises(UserInputError, match=r"before does not say at which temperature .* export the agent"):
+        calibrate(tiny.agent_of_before(tmp_path / "before"), "beta=[-1]")
     with pytest.raises(UserInputError, match="run=<folder>"):
         make_calibration(compose("calibrate", []))
     OmegaConf.save(tiny.tiny_cfg("sac"), tmp_path / "config.yaml", resolve=True)

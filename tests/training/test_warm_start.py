@@ -23,7 +23,7 @@ from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.setup import make_trainer, resume_training
 from rcdsac_trl.training.trainer import StopTraining, Trainer
-from tiny import TINY
+from tiny import TINY, agent_of_before
 
 CRITICS, TARGETS = "critic_network_params.", "target_critic_network_params."
 
@@ -57,12 +57,13 @@ def targets_are_critics(loss: LossModule) -> bool:
 
 
 # ------------------------------------------------------------------------------------------------ what is chosen
-def test_an_agent_goes_on_as_what_it_is() -> None:
-    shipped = named_agent("dsac_pow-narrow").settings
-    found = settings("init=dsac_pow-narrow", "map=hard")
+def test_an_agent_goes_on_as_what_it_is(tmp_path: Path) -> None:
+    before = agent_of_before(tmp_path / "before")
+    shipped = named_agent(before).settings
+    found = settings(f"init={before}", "map=hard")
     assert (found.algo, found.sensor, found.robot) == (shipped.algo, shipped.sensor, shipped.robot)
     assert found.network == shipped.network
-    assert found.network.padding == "none"  # which training's defaults are not
+    assert found.network.restart_steps == 2  # which the preset's are not
     plain = settings("+algo=dsac_pow", "algo.beta=-1", "map=hard")
     assert found.map == plain.map != shipped.map
     assert found.learner == plain.learner  # hyper-parameters are today's
@@ -71,18 +72,19 @@ def test_an_agent_goes_on_as_what_it_is() -> None:
     assert plain.schedule.pursuit_iterations > 0
 
 
-def test_what_a_user_chooses_holds() -> None:
+def test_what_a_user_chooses_holds(tmp_path: Path) -> None:
+    init = f"init={agent_of_before(tmp_path / 'before')}"
     given = (
         "+algo=rcdsac_cvar",
         "sensor=sparse",
         "schedule.pursuit_iterations=2",
         "robot.max_speed_m_per_s=0.3",
     )
-    for overrides in (("init=dsac_pow-narrow", *given), (*given, "init=dsac_pow-narrow")):
+    for overrides in ((init, *given), (*given, init)):
         found = settings(*overrides)
         assert (found.algo.name, found.sensor.name) == ("rcdsac_cvar", "sparse")
         assert (found.schedule.pursuit_iterations, found.robot.max_speed_m_per_s) == (2, 0.3)
-        assert found.network.padding == "none"
+        assert found.network.restart_steps == 2
     assert settings("+algo=sac", "init=null").init is None
 
 
@@ -221,7 +223,7 @@ def test_a_shipped_agent_on_another_map_robot_and_measure(tmp_path: Path) -> Non
 
 
 def test_a_temperature_that_nobody_knows_is_said(tmp_path: Path) -> None:
-    begun("dsac_pow-narrow", tmp_path / "run")
+    begun(agent_of_before(tmp_path / "before"), tmp_path / "run")
     assert "not copied: temperature (unknown: learner.alpha_init=" in (tmp_path / "run" / "train.log").read_text()
 
 

@@ -56,9 +56,7 @@ class ActingSettings:
             )
         one_of("acting.over_critics", self.over_critics, OverCritics)
         if not 0.0 <= self.margin_m <= _WIDEST_MARGIN_M:
-            raise UserInputError(
-                f"acting.margin_m={self.margin_m:g} is outside [0, {_WIDEST_MARGIN_M:g}]: give metres"
-            )
+            raise UserInputError(f"acting.margin_m={self.margin_m:g} is outside [0, {_WIDEST_MARGIN_M:g}]: give metres")
 
     def __str__(self) -> str:
         """Say it in words, as a card does."""
