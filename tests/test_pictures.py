@@ -47,11 +47,11 @@ class Staged:
     ("careful", "neutral", "shown"),
     [
         (None, 100, 100),
-        (115, 100, 100),  # after the film
-        (114, 100, None),  # in it
+        (129, 100, 100),  # after the film
+        (128, 100, None),  # in it
         (90, 100, None),
-        (None, 44, None),  # the film would begin before the drive
-        (None, 45, 45),
+        (None, 26, None),  # the film would begin before the drive
+        (None, 27, 27),
         (None, 299, 299),
         (None, 300, None),  # too late
         (None, None, None),

@@ -118,7 +118,7 @@ def test_what_critics_choose_does_not_depend_on_who_drives_beside(run: Path, tmp
     assert not rows[0].equals(rows[1])
     assert contents(one) == contents(by_mean)
     described = json.loads((alone / "evaluation.json").read_text())
-    assert described["acting"] == {"num_candidates": 6, "spread": 1.5, "over_critics": "minimum"}
+    assert described["acting"] == {"num_candidates": 6, "spread": 1.5, "over_critics": "minimum", "margin_m": 0.0}
 
 
 def test_an_exported_agent_acts_as_was_chosen_for_its_export(run: Path, tmp_path: Path) -> None:

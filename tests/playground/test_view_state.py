@@ -70,7 +70,7 @@ def test_weights_of_every_measure_share_the_whole_out(name: str) -> None:
         assert weights.min() >= 0.0
 
 
-@pytest.mark.parametrize("agent", ["rcdsac_pow-narrow", "rcdsac_cvar-narrow", "dsac_pow-narrow"])
+@pytest.mark.parametrize("agent", ["rcdsac_pow-narrow", "rcdsac_cvar-narrow", "dsac_pow_-1-narrow"])
 def test_the_curve_and_the_value_of_every_action_agree_with_the_policy(agent: str) -> None:
     with contextlib.closing(drive(agent=agent)) as played:
         (robot,) = played.robots
