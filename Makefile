@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
-# Python compiles what it imports, once; to compile all that is installed takes much longer than to unpack it.
+# Python compiles what it imports, once, and not all that is installed.
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 # Programs of benchmarks/, in the order they run.
@@ -21,7 +21,7 @@ help: ## list the targets
 train: install ## train a risk-conditioned agent: two cores, about 40 minutes
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
 
-smoke: install ## rehearse the whole training in under a minute; it learns nothing
+smoke: install ## rehearse the whole training in a minute or two; it learns nothing
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow preset=smoke
 
 play: install ## drive a shipped agent on a page in your browser; Ctrl-C ends it

@@ -80,7 +80,7 @@ def nearer(read: NDArray[np.float32], margin_m: float) -> NDArray[np.float32]:
     """Return what heads read if all that is foreseen were nearer by a margin, but for what is too far to count.
 
     Args:
-        read: what heads read, what is foreseen last, float32 [.., n >= 44].
+        read: what heads read, what is foreseen last, float32 [.., n >= 44]; without a margin any.
         margin_m: the margin, m.
 
     Example:
@@ -88,6 +88,8 @@ def nearer(read: NDArray[np.float32], margin_m: float) -> NDArray[np.float32]:
         >>> [round(float(0.8 / 10.0**told), 3) for told in nearer(read, 0.03)[:2]]
         [0.07, 0.07]
     """
+    if margin_m == 0.0:
+        return read
     told = read[..., -FORESEEN_SIZE:]
     least_m, far_m = (np.float32(gap_m) for gap_m in FORESEEN_SPAN_M)
     gap_m = far_m * np.power(np.float32(10.0), -told) - np.float32(margin_m)

@@ -78,12 +78,8 @@ class ChoosingPolicy(TensorDictModuleBase):
         for number, (encoder, _) in enumerate(self._critics):
             seen = [tensordict[key] for key in (*encoder.in_keys, "is_init")]
             memory, self._states[number] = self._steps[number](*seen, self._states[number])
-            memories.append(self._with_margin(memory))
+            memories.append(torch.from_numpy(nearer(memory.numpy(), self._margin_m)))
         return memories
-
-    def _with_margin(self, memory: Tensor) -> Tensor:
-        """Return what heads read if all that is foreseen were nearer by the margin."""
-        return memory if self._margin_m == 0.0 else torch.from_numpy(nearer(memory.numpy(), self._margin_m))
 
     def _values(self, memories: Sequence[Tensor], candidates: Tensor, beta: Tensor) -> Tensor:
         """Return what the critics together say of an agent's candidates ``[K, 2]``, ``[K]``."""

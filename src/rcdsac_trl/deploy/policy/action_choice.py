@@ -55,8 +55,7 @@ class ActionChoice:
             embedded: the same in [0, 1].
         """
         candidates = self._actor.action(read[0], embedded, self._noise)
-        told = read[1:] if self._margin_m == 0.0 else nearer(read[1:], self._margin_m)
-        values = self._critics.means(told, candidates, self._gate_at(beta, embedded))
+        values = self._critics.means(nearer(read[1:], self._margin_m), candidates, self._gate_at(beta, embedded))
         best: Array = candidates[np.argmax(self._over.reduce(values))]
         return best
 
