@@ -2,6 +2,8 @@
 
 import importlib
 import json
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +16,7 @@ from tiny import TINY
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 NAMES = {path.stem for path in BENCHMARKS.glob("*.py")}
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SMALL = [*TINY, "world.num_agents=2"]
 
 
@@ -186,6 +189,17 @@ def test_whole_job(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     few = [given for given in SMALL if not given.startswith("schedule.iterations")]
     run(load("whole_job"), monkeypatch, "--json", "--iterations=1", *few)
     assert printed(capsys)["wall_seconds"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium to open the page in")
+def test_play_page(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = load("play_page")
+    monkeypatch.setattr(program, "SCENES", {"one": "agent=sac-narrow", "two": "agent=sac-narrow&second=sac-narrow"})
+    found = program.measured(CHROMIUM, os.sched_getaffinity(0), 2.0)
+    assert 0.0 < found["page_sent_s"] < found["robot_moves_s"]
+    assert 0.0 < found["one: driven a second"] < found["two: driven a second"]
+    assert all(found[f"{name}: shown a second"] > 0.0 for name in ("one", "two"))
 
 
 def test_soak(load: Any) -> None:
