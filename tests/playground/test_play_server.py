@@ -134,7 +134,10 @@ def test_a_bad_link_gets_a_sentence_before_a_page_is_made(
     assert not server._server.get_sessions()
 
 
-def test_a_closed_tab_ends_its_page_and_one_that_loads_slowly_keeps_its_own(tmp_path: Path) -> None:
+def test_a_closed_tab_ends_its_page_and_one_that_loads_slowly_keeps_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(play_server, "_CHECK_UNUSED_MS", 20)
     server = PlayServer(offers(), host="localhost", port=0, max_sessions=2, films=tmp_path)
     server.start()
     for seed in (0, 1):
