@@ -1,7 +1,7 @@
 """Trains tiny runs in processes that die of SIGKILL at an event that the test names; see test_resume.py.
 
-Started once as a program, so that importing and compiling is paid once; each line on standard input is a job, and
-each job a fork of this process. Events are counted, so that where a run dies does not depend on the clock.
+A process of its own serves them, so that what it changes is of this alone: each line that it reads is a job, and each
+job a fork of it. Events are counted, so that where a run dies does not depend on the clock.
 """
 
 import json
@@ -13,9 +13,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
-
-import torch
+from typing import Any, TextIO
 
 from rcdsac_trl.storage.sequence_replay import SequenceReplay
 from rcdsac_trl.system import process_pool
@@ -72,15 +70,19 @@ def work(job: dict[str, Any]) -> None:
     Path(job["out"]).write_text(json.dumps(happened))
 
 
-def main() -> None:
-    """Do jobs until standard input ends; answer each with the status of its process."""
-    torch.set_num_threads(1)
+def serve(jobs: TextIO, answers: TextIO, prepared: list[str]) -> None:
+    """Do jobs until there are no more; answer each with the status of its process.
+
+    Args:
+        jobs: a job a line.
+        answers: an answer a line.
+        prepared: overrides of the training that goes before: what it has compiled and which maps it has made, all
+            forks have.
+    """
     process_pool.START_METHOD = "fork"  # a fork server would import everything for each job anew
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what trainings print goes elsewhere
-    with TemporaryDirectory() as folder:  # what is compiled and which maps are made, all forks then have
-        tiny_trainer(Path(folder), "rcdsac_pow", *json.loads(sys.argv[1]), "logger=none").run()
-    for line in sys.stdin:
+    with TemporaryDirectory() as folder:
+        tiny_trainer(Path(folder), "rcdsac_pow", *prepared, "logger=none").run()
+    for line in jobs:
         job = json.loads(line)
         alive, held = os.pipe()
         child = os.fork()
@@ -104,7 +106,3 @@ def main() -> None:
         os.close(alive)
         answers.write(f"{status}\n")
         answers.flush()
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,13 @@
 """The notebooks run from top to bottom, and are saved with what they show."""
 
 import copy
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
+from nbformat.v4 import new_code_cell, new_notebook
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = sorted(path.name for path in FOLDER.glob("*.ipynb"))
@@ -35,12 +37,29 @@ def figures(notebook: nbformat.NotebookNode) -> int:
     return sum("image/png" in output.get("data", {}) for output in outputs(notebook))
 
 
+@pytest.fixture(scope="module")
+def execute() -> Iterator[Callable[[nbformat.NotebookNode], None]]:
+    """Run notebooks in one kernel, which imports once; each begins in their folder, with nothing defined."""
+    client = NotebookClient(new_notebook(), timeout=600, resources={"metadata": {"path": str(FOLDER)}})
+
+    def run(notebook: nbformat.NotebookNode) -> None:
+        """Run all cells; raises a cell's error, should there be one."""
+        client.nb = copy.deepcopy(notebook)
+        client.nb.cells.insert(0, new_code_cell(f"%reset -f\n%cd -q {FOLDER}"))
+        client.execute(cleanup_kc=False)
+        notebook.cells = client.nb.cells[1:]
+
+    yield run
+    client.nb = new_notebook()
+    client.execute()  # and end the kernel
+
+
 def test_there_are_three_stories() -> None:
     assert NOTEBOOKS == ["1_quantile_curves.ipynb", "2_from_runs_to_the_table.ipynb", "3_your_own_risk_measure.ipynb"]
 
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
-def test_it_runs_and_shows_what_was_saved(name: str) -> None:
+def test_it_runs_and_shows_what_was_saved(name: str, execute: Callable[[nbformat.NotebookNode], None]) -> None:
     saved = nbformat.read(FOLDER / name, as_version=4)
     nbformat.validate(saved)
     code = [cell for cell in saved.cells if cell.cell_type == "code"]
@@ -50,8 +69,7 @@ def test_it_runs_and_shows_what_was_saved(name: str) -> None:
     for cell in executed.cells:
         if cell.cell_type == "code":
             cell.outputs = []
-    # Raises the cell's error, should there be one.
-    NotebookClient(executed, timeout=600, resources={"metadata": {"path": str(FOLDER)}}).execute()
+    execute(executed)
     assert figures(executed) == figures(saved) > 0
 
 

@@ -45,24 +45,26 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site"
 
 
-def lend_compiled(installed: Path) -> None:
-    """Give the wheel what numba compiled of the same files in the checkout: compiling is not what is tested here.
+@pytest.fixture(scope="module")
+def lent(installed: Path) -> Path:
+    """Give the wheel what was compiled of the same files in the checkout: compiling is not what is tested here.
 
     A cache belongs to a file of that size and time of change; without any, the wheel's program compiles for itself.
     """
     source = ROOT / "src"
-    caches = [
-        cache for suffix in ("nbi", "nbc") for cache in source.rglob(f"*.{suffix}")
-    ]  # what lists, then what is listed
-    for cache in caches:
-        target = installed / cache.relative_to(source)
-        target.parent.mkdir(exist_ok=True)
-        shutil.copyfile(cache, target)
-    for module in {cache.parents[1] / f"{cache.name.split('.')[0]}.py" for cache in caches}:
-        if not module.exists():  # it has been moved since it was compiled
-            continue
+    modules: set[Path] = set()
+    for suffix in ("pyc", "nbi", "nbc"):  # of numba's, what lists, then what is listed
+        for cache in source.rglob(f"*.{suffix}"):
+            module = cache.parents[1] / f"{cache.name.split('.')[0]}.py"
+            if module.exists():  # it has not been moved since it was compiled
+                target = installed / cache.relative_to(source)
+                target.parent.mkdir(exist_ok=True)
+                shutil.copyfile(cache, target)
+                modules.add(module)
+    for module in modules:
         times = module.stat()
         os.utime(installed / module.relative_to(source), ns=(times.st_atime_ns, times.st_mtime_ns))
+    return installed
 
 
 def python(installed: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -131,16 +133,16 @@ def modules_of_dependencies(installed: Path) -> list[str]:
     return sorted(owned - {*BARE})
 
 
-def test_the_wheel_drives_with_numpy_numba_and_safetensors_alone(installed: Path, tmp_path: Path) -> None:
-    kept_away = modules_of_dependencies(installed)
+def test_the_wheel_drives_with_numpy_numba_and_safetensors_alone(lent: Path, tmp_path: Path) -> None:
+    kept_away = modules_of_dependencies(lent)
     assert {"torch", "torchrl", "hydra", "pybullet", "gymnasium", "pandas", "yaml"} <= set(kept_away)
-    driven = python(installed, tmp_path, "-c", DRIVE, *kept_away)
+    driven = python(lent, tmp_path, "-c", DRIVE, *kept_away)
     assert driven.returncode == 0, driven.stderr
     version, file = driven.stdout.split()
     assert version == rcdsac_trl.__version__
-    assert Path(file) == installed / "rcdsac_trl" / "__init__.py"
-    assert metadata(installed)["Version"] == version
-    (scripts,) = installed.glob("*.dist-info/entry_points.txt")
+    assert Path(file) == lent / "rcdsac_trl" / "__init__.py"
+    assert metadata(lent)["Version"] == version
+    (scripts,) = lent.glob("*.dist-info/entry_points.txt")
     assert scripts.read_text().splitlines()[1].startswith("rcdsac-trl = ")
 
 
@@ -166,12 +168,11 @@ def test_the_wheel_in_an_environment_of_its_own_drives(installed: Path, tmp_path
     assert str(tmp_path / "bare") in driven.stdout
 
 
-def test_the_wheel_trains_outside_the_checkout(installed: Path, tmp_path: Path) -> None:
-    found = python(installed, tmp_path, "-c", "import rcdsac_trl; print(rcdsac_trl.__file__)")
-    assert Path(found.stdout.strip()) == installed / "rcdsac_trl" / "__init__.py"
-    lend_compiled(installed)
+def test_the_wheel_trains_outside_the_checkout(lent: Path, tmp_path: Path) -> None:
+    found = python(lent, tmp_path, "-c", "import rcdsac_trl; print(rcdsac_trl.__file__)")
+    assert Path(found.stdout.strip()) == lent / "rcdsac_trl" / "__init__.py"
     run = tmp_path / "run"
-    trained = python(installed, tmp_path, "-m", "rcdsac_trl.train", "+algo=sac", *TINY, f"hydra.run.dir={run}")
+    trained = python(lent, tmp_path, "-m", "rcdsac_trl.train", "+algo=sac", *TINY, f"hydra.run.dir={run}")
     assert trained.returncode == 0, trained.stderr
     assert {path.name for path in run.iterdir()} == {
         "checkpoints",

@@ -16,6 +16,7 @@ import pytest
 from omegaconf import DictConfig
 
 import tiny
+from forked import Forked
 from rcdsac_trl import evaluate, train
 from rcdsac_trl.cli import Command, precheck
 from rcdsac_trl.config.compose import choices, compose
@@ -463,29 +464,49 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
         assert (cwd / "there" / name).read_bytes() == (here / name).read_bytes()
 
 
-def interrupt(folder: Path, *arguments: str, by: signal.Signals = signal.SIGINT) -> tuple[int, str]:
-    """Train without end, press Ctrl-C after the second iteration; return the exit code and stderr."""
-    endless = [*TINY, "schedule.iterations=100000", "validation.every_iterations=100000", *arguments]
-    process = start(folder, "rcdsac_trl.train", POW, *endless, f"hydra.run.dir={folder / 'run'}")
+def endless(folder: Path, *arguments: str) -> list[str]:
+    """Return the arguments of a training without end."""
+    without_end = ["schedule.iterations=100000", "validation.every_iterations=100000"]
+    return [POW, *TINY, *without_end, *arguments, f"hydra.run.dir={folder / 'run'}"]
+
+
+def interrupt(folder: Path, pid: int, has_ended: Callable[[], bool], by: signal.Signals) -> None:
+    """Send a signal to an endless training and all its processes, as a terminal does, after the second iteration."""
     log = folder / "run" / "train.log"
     deadline = time.monotonic() + 300
-    while process.poll() is None and time.monotonic() < deadline:
+    while not has_ended() and time.monotonic() < deadline:
         if log.exists() and "   2/100000" in log.read_text():  # the first one is saved then
             break
-        time.sleep(0.1)
-    os.killpg(process.pid, by)  # as a terminal does: to the whole group, workers included
+        time.sleep(0.02)
+    os.killpg(pid, by)
+
+
+def ctrl_c(folder: Path, *arguments: str) -> tuple[int, str]:
+    """Train in the real program until Ctrl-C; return the exit code and stderr."""
+    process = start(folder, "rcdsac_trl.train", *endless(folder, *arguments))
+    interrupt(folder, process.pid, lambda: process.poll() is not None, signal.SIGINT)
     _, err = process.communicate(timeout=300)
     return process.returncode, err
 
 
-@pytest.mark.parametrize(
-    ("by", "code", "told"),
-    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "ended by SIGTERM")],
-)
+def sigterm(folder: Path) -> tuple[int, str]:
+    """Train in a child of this process until SIGTERM; likewise."""
+
+    def program() -> None:
+        os.environ |= NO_RESTART
+        sys.argv = ["train", *endless(folder)]
+        train.main()
+
+    training = Forked(program, folder / "said")
+    interrupt(folder, training.pid, lambda: training.code(wait=False) is not None, signal.SIGTERM)
+    return training.code() or 0, training.said
+
+
+@pytest.mark.parametrize(("end", "code", "told"), [(ctrl_c, 130, "interrupted"), (sigterm, 143, "ended by SIGTERM")])
 def test_ctrl_c_and_sigterm_end_with_a_checkpoint_and_without_a_traceback(
-    tmp_path: Path, by: signal.Signals, code: int, told: str
+    tmp_path: Path, end: Callable[[Path], tuple[int, str]], code: int, told: str
 ) -> None:
-    ended, err = interrupt(tmp_path, by=by)
+    ended, err = end(tmp_path)
     assert ended == code
     assert "Traceback" not in err
     assert "leaked" not in err
@@ -529,7 +550,7 @@ def test_sigterm_ends_an_evaluation_and_its_processes_and_keeps_the_maps_that_ha
     ids=["workers", "multi", "validation", "ray"],
 )
 def test_ctrl_c_with_processes(tmp_path: Path, processes: list[str]) -> None:
-    code, err = interrupt(tmp_path, *processes)
+    code, err = ctrl_c(tmp_path, *processes)
     assert code == 130
     assert "Traceback" not in err
     assert load_progress(tmp_path / "run" / "checkpoints", "last").updates >= 2

@@ -4,20 +4,24 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from forked import Forked
+from rcdsac_trl import train
 from rcdsac_trl.config.compose import choices
 from rcdsac_trl.errors import FaultError, UserInputError
+from rcdsac_trl.experiments import sweep
 from rcdsac_trl.experiments.sweep import Job, State, runs_of
 from rcdsac_trl.experiments.sweep_jobs import check_single, make_sweep
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import load_progress
+from rcdsac_trl.system import subprocess_job
 from tiny import SMALL, Calls, first_combinations_only, yaml_of
 
 
@@ -254,14 +258,7 @@ def test_a_folder_without_an_index_is_no_sweep(tmp_path: Path) -> None:
         runs_of(tmp_path)
 
 
-# ------------------------------------------------------------------------------------------------ the real program
-def wait_for(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 600
-    while not condition() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert condition(), process.communicate()
-
-
+# ------------------------------------------------------------------------------------------------ killed
 def ended(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -273,22 +270,30 @@ def ended(pid: int) -> bool:
 def test_a_killed_sweep_goes_on_with_what_is_not_finished(calls: Calls, tmp_path: Path) -> None:
     asked = ["+algo=sac", *SMALL, "schedule.iterations=1,4", "checkpoint.keep=9", "hydra.sweep.dir=all"]
     first, second = (tmp_path / "all" / f"sac-narrow-iterations_{n}-s0" for n in (1, 4))
-    process = subprocess.Popen(
-        [sys.executable, "-m", "rcdsac_trl.train", "-m", *asked],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
-    wait_for(lambda: (second / "checkpoints" / "iteration-000001").exists(), process)
+    call_here = sweep.call
+
+    def call(command: list[str], output: Path, *rest: Any) -> int:
+        """Train what is killed in a process, as sweeps do."""
+        return (subprocess_job.call if output.parent == second else call_here)(command, output, *rest)
+
+    def program() -> None:
+        sweep.call = call  # type: ignore[assignment]
+        sys.argv = ["train", "-m", *asked]
+        train.main()
+
+    process = Forked(program, tmp_path / "said")
+    deadline = time.monotonic() + 600
+    while not (second / "checkpoints" / "iteration-000001").exists():
+        assert process.code(wait=False) is None, process.said
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
     training = [
         int(path.parent.name)
         for path in Path("/proc").glob("[0-9]*/stat")
         if path.read_text().rsplit(")", 1)[1].split()[1] == str(process.pid)
     ]
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    os.kill(process.pid, signal.SIGKILL)
+    assert process.code() == -signal.SIGKILL
     assert len(training) == 1
     deadline = time.monotonic() + 60
     while not ended(training[0]) and time.monotonic() < deadline:

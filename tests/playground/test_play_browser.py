@@ -5,13 +5,15 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import BrowserContext, Page, sync_playwright
 from scenes_to_play import offers
 
+from rcdsac_trl.playground import play_server
 from rcdsac_trl.playground.palette import PALETTES
 from rcdsac_trl.playground.play_server import PlayServer, in_thread
 
@@ -21,6 +23,8 @@ pytestmark = pytest.mark.skipif(
 )
 POW = "agent=rcdsac_pow-narrow"
 PATIENCE_S = 300.0
+# So often these tests' server looks who has left: they wait for it after every page.
+LOOK_MS = 50
 GOAL, OBSTACLE = PALETTES["light"]["goal"], PALETTES["light"]["obstacle"]
 SWITCHES = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
@@ -30,32 +34,41 @@ SWITCHES = (
 OWN_LINES = re.compile(r"^\[bokeh|^Bokeh items were rendered|^Failed to load resource: .* status of (400|503) ")
 
 
+@contextmanager
+def serving(films: Path, port: int = 0, look_ms: int = LOOK_MS) -> Iterator[PlayServer]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(play_server, "_CHECK_UNUSED_MS", look_ms)
+        with in_thread(lambda: PlayServer(offers(), host="localhost", port=port, max_sessions=2, films=films)) as made:
+            yield made
+
+
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PlayServer]:
-    folder = tmp_path_factory.mktemp("films")
-    with in_thread(lambda: PlayServer(offers(), host="localhost", port=0, max_sessions=2, films=folder)) as made:
+    with serving(tmp_path_factory.mktemp("films")) as made:
         yield made
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser() -> Iterator[BrowserContext]:
+    """One profile for all pages: what they load is then read and compiled once."""
     with sync_playwright() as playwright:
         opened = playwright.chromium.launch(executable_path=CHROMIUM, args=SWITCHES.split())
-        yield opened
+        profile = opened.new_context()
+        profile.set_default_timeout(1000 * PATIENCE_S)
+        yield profile
         opened.close()
 
 
 @pytest.fixture
-def opened(browser: Browser, server: PlayServer) -> Iterator[Callable[..., Page]]:
+def opened(browser: BrowserContext, server: PlayServer) -> Iterator[Callable[..., Page]]:
     """Open pages; at the end nothing but its own lines is on their consoles, and no drive is left."""
     pages: list[Page] = []
     said: list[str] = []
 
     def open_(query: str = "", size: tuple[int, int] = (1280, 800), dark: bool = False) -> Page:
-        page = browser.new_page(
-            viewport={"width": size[0], "height": size[1]}, color_scheme="dark" if dark else "light"
-        )
-        page.set_default_timeout(1000 * PATIENCE_S)
+        page = browser.new_page()
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        page.emulate_media(color_scheme="dark" if dark else "light")
         page.on("console", lambda line: said.append(line.text))
         page.on("pageerror", lambda error: said.append(f"error: {error}"))
         page.on("request", lambda asked: said.append(asked.url) if str(server.port) not in asked.url else None)
@@ -258,11 +271,16 @@ def test_a_film_is_made_while_it_pauses(opened, server: PlayServer) -> None:
     assert answer.body()[:4] == b"GIF8"
 
 
-def test_who_has_left_makes_room(opened, server: PlayServer) -> None:
-    page = standing(opened("agent=sac-narrow&paused=on"))
-    for _ in range(3):  # of two pages that may drive
-        page.reload()
-        page.wait_for_function("document.querySelector('#robot0 [data-field=time]')?.textContent")
+def test_who_has_left_makes_room(browser: BrowserContext, tmp_path: Path) -> None:
+    with serving(tmp_path, look_ms=3_600_000) as server:  # nobody looks who has left before another one comes
+        page = browser.new_page()
+        page.goto(f"{server.address}?agent=sac-narrow&paused=on")
+        standing(page)
+        for _ in range(3):  # of two pages that may drive
+            page.reload()
+            page.wait_for_function("document.querySelector('#robot0 [data-field=time]')?.textContent")
+        until(lambda: server.num_drives == 2)
+        page.close()
 
 
 def test_sessions_share_nothing_one_too_many_is_told_so_and_a_closed_tab_ends_its_drive(
@@ -310,18 +328,14 @@ def test_zoomed_in_each_map_follows_its_robot_and_a_message_moves_nothing(opened
 
 
 def test_a_server_that_ends_is_said_to_and_one_that_answers_again_opens_the_scene(
-    browser: Browser, tmp_path: Path
+    browser: BrowserContext, tmp_path: Path
 ) -> None:
-    def serve(port: int) -> PlayServer:
-        return PlayServer(offers(), host="localhost", port=port, max_sessions=2, films=tmp_path)
-
     page = browser.new_page()
-    page.set_default_timeout(1000 * PATIENCE_S)
-    with in_thread(lambda: serve(0)) as server:
+    with serving(tmp_path) as server:
         page.goto(f"{server.address}?agent=sac-narrow&seed=4&theme=dark&paused=on")
         standing(page, 2)
     page.locator("#message", has_text="The server does not answer").wait_for()
-    with in_thread(lambda: serve(server.port)) as again:
+    with serving(tmp_path, server.port) as again:
         driving(page)
         assert again.num_drives == 1
         assert page.url.endswith("?agent=sac-narrow&seed=4&theme=dark")

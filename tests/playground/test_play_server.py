@@ -134,7 +134,10 @@ def test_a_bad_link_gets_a_sentence_before_a_page_is_made(
     assert not server._server.get_sessions()
 
 
-def test_a_closed_tab_ends_its_page_and_one_that_loads_slowly_keeps_its_own(tmp_path: Path) -> None:
+def test_a_closed_tab_ends_its_page_and_one_that_loads_slowly_keeps_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(play_server, "_CHECK_UNUSED_MS", 20)
     server = PlayServer(offers(), host="localhost", port=0, max_sessions=2, films=tmp_path)
     server.start()
     for seed in (0, 1):
@@ -247,7 +250,9 @@ def test_without_the_package_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPat
         read_config(compose("play", []), PlaySettings)
 
 
-def test_no_ctrl_c_is_lost_to_what_collects_garbage(tmp_path: Path) -> None:
+def test_no_ctrl_c_is_lost_to_what_collects_garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gc, "freeze", lambda: None)  # what this test leaves is collected like all else
+
     class Garbage:
         pass
 
@@ -266,7 +271,6 @@ def test_no_ctrl_c_is_lost_to_what_collects_garbage(tmp_path: Path) -> None:
             server.run(browser=False)
     finally:
         loop.remove_timeout(over)
-        gc.unfreeze()
 
 
 def test_the_program_says_where_it_is_and_ends_with_ctrl_c(tmp_path: Path) -> None:

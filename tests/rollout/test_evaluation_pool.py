@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from endless_drive import endless
 
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.rollout.evaluation_pool import Drive, EvaluationPool, Rows, evaluate_maps
@@ -30,17 +31,6 @@ def counting() -> Iterator[Drive]:
 def breaking() -> Iterator[Drive]:
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         os._exit(7)
-
-    yield drive
-
-
-@contextlib.contextmanager
-def endless(told: Path) -> Iterator[Drive]:
-    def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
-        told.write_text(str(os.getpid()))
-        while True:
-            before_step()
-            time.sleep(0.01)
 
     yield drive
 
@@ -128,8 +118,8 @@ def test_a_process_ends_by_itself_when_the_main_one_is_killed(tmp_path: Path) ->
         "from functools import partial\n"
         "from pathlib import Path\n"
         "from rcdsac_trl.rollout import evaluation_pool as drivers\n"
-        "from test_evaluation_pool import endless\n"
-        "drivers._PRELOADED = 'test_evaluation_pool'\n"
+        "from endless_drive import endless\n"
+        "drivers._PRELOADED = 'endless_drive'\n"
         "drivers.EvaluationPool(partial(endless, Path(sys.argv[1])), 1, processes=1)\n"
         "time.sleep(1000)\n"
     )

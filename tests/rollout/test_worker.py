@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.rollout.worker import EpisodeBatch, side_by_side
 from rcdsac_trl.rollout.worker_processes import Drive, RolloutRequest, WorkerProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress
+from rcdsac_trl.system import process_pool
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.world.task.env import make_env
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -168,18 +170,17 @@ TIMEOUT_S = 5.0
 
 
 @contextlib.contextmanager
-def answering(seconds: float, does: str) -> Iterator[Drive]:
-    """Answer the first request at once; the second one only after some time, in some way."""
+def answering(does: str, until: Path | None = None) -> Iterator[Drive]:
+    """Answer the first request at once; the second one in some way, or when a file is there."""
 
     def drive(request: RolloutRequest, before_step: Callable[[], None]) -> EpisodeBatch:
-        until = time.monotonic() + seconds * request.iteration
-        while time.monotonic() < until:
+        while request == SECOND and until is not None and not until.exists():
             time.sleep(0.01)
             if does == "steps":
                 before_step()
-        if does == "ends" and request == SECOND:
+        if request == SECOND and does == "ends":
             os._exit(7)
-        if does == "fails" and request == SECOND:
+        if request == SECOND and does == "fails":
             raise ValueError("a mistake")
         return EpisodeBatch({}, {"action": np.full((1, 1, 2), os.getpid() % 1000, np.float32)}, {})
 
@@ -191,10 +192,10 @@ def processes() -> Iterator[Callable[..., WorkerProcesses]]:
     """Start processes that have answered once: what starting takes counts for nothing here."""
     started: list[WorkerProcesses] = []
 
-    def start(*makes: Any) -> WorkerProcesses:
+    def start(*makes: Any, timeout_s: float = TIMEOUT_S) -> WorkerProcesses:
         started.append(group := WorkerProcesses(makes, [f"agents {n}" for n in range(len(makes))], None))
         group.ask(FIRST)
-        group.pool._timeout_s = TIMEOUT_S
+        group.pool._timeout_s = timeout_s
         return group
 
     yield start
@@ -204,30 +205,69 @@ def processes() -> Iterator[Callable[..., WorkerProcesses]]:
     assert not multiprocessing.active_children()
 
 
-def test_slow_processes_that_take_steps_do_not_count_as_hung(processes: Callable[..., WorkerProcesses]) -> None:
-    group = processes(*[partial(answering, TIMEOUT_S + 2.0, "steps")] * 2)
+class Clock:
+    """Stands in for the pool's clock: whenever it is looked at and time passes, that is nearly what the pool allows.
+
+    When time passes is the test's to say, so nothing depends on how busy the machine is.
+    """
+
+    def __init__(self, passes: Callable[[], bool]) -> None:
+        self._passes, self.now_s = passes, 0.0
+
+    def monotonic(self) -> float:
+        self.now_s += 0.9 * TIMEOUT_S * self._passes()
+        return self.now_s
+
+
+def test_slow_processes_that_take_steps_do_not_count_as_hung(
+    processes: Callable[..., WorkerProcesses], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    group = processes(*[partial(answering, "steps", tmp_path / "enough")] * 2)
     pids = [process.pid for process in group.pool.processes]
+    before = [0, 0]
+
+    def both_have_stepped() -> bool:
+        steps = [each.value for each in group.pool._steps]
+        if any(now == then for now, then in zip(steps, before, strict=True)):
+            return False
+        before[:] = steps
+        if clock.now_s > 3 * TIMEOUT_S:
+            (tmp_path / "enough").touch()
+        return True
+
+    clock = Clock(both_have_stepped)
+    monkeypatch.setattr(process_pool, "time", clock)
     assert group.ask(SECOND)["action"][:, 0, 0].tolist() == [pid % 1000 for pid in pids]
+    assert clock.now_s > 3 * TIMEOUT_S
 
 
-@pytest.mark.parametrize(
-    ("does", "told"),
-    [("ends", "ended with exit code 7"), ("fails", "ended with exit code 1"), ("sleeps", "made no step within 5 s")],
-)
-def test_a_process_that_fails_is_named(processes: Callable[..., WorkerProcesses], does: str, told: str) -> None:
-    slow = 1000.0 if does == "sleeps" else 0.0
-    group = processes(partial(answering, 0.0, "steps"), partial(answering, slow, does))
-    with pytest.raises(WorkerError, match=rf"^worker process 2 of 2 \(agents 1\) {told}$"):
+def test_a_process_that_takes_no_step_is_named(
+    processes: Callable[..., WorkerProcesses], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    group = processes(partial(answering, "answers"), partial(answering, "sleeps", tmp_path / "never"))
+    monkeypatch.setattr(process_pool, "time", Clock(lambda: not group.pool._open_requests[0]))
+    with pytest.raises(WorkerError, match=r"^worker process 2 of 2 \(agents 1\) made no step within 5 s$"):
+        group.ask(SECOND)
+
+
+@pytest.mark.parametrize(("does", "code"), [("ends", 7), ("fails", 1)])
+def test_a_process_that_fails_is_named(processes: Callable[..., WorkerProcesses], does: str, code: int) -> None:
+    group = processes(partial(answering, "answers"), partial(answering, does))
+    with pytest.raises(WorkerError, match=rf"^worker process 2 of 2 \(agents 1\) ended with exit code {code}$"):
         group.ask(SECOND)
 
 
 @pytest.mark.parametrize(
-    ("number", "told"), [(signal.SIGKILL, "was killed by SIGKILL"), (signal.SIGSTOP, "made no step within 5 s")]
+    ("number", "timeout_s", "told"),
+    [
+        (signal.SIGKILL, TIMEOUT_S, "was killed by SIGKILL"),
+        (signal.SIGSTOP, 0.2, "made no step within 0.2 s"),
+    ],
 )
 def test_a_process_that_cannot_even_be_asked_is_named(
-    processes: Callable[..., WorkerProcesses], number: signal.Signals, told: str
+    processes: Callable[..., WorkerProcesses], number: signal.Signals, timeout_s: float, told: str
 ) -> None:
-    group = processes(*[partial(answering, 0.0, "steps")] * 2)
+    group = processes(*[partial(answering, "answers")] * 2, timeout_s=timeout_s)
     os.kill(group.pool.processes[0].pid, number)
     large = SECOND._replace(weights=bytes(10_000_000))  # more than a pipe holds
     with pytest.raises(WorkerError, match=rf"^worker process 1 of 2 \(agents 0\) {told}$"):

@@ -4,11 +4,12 @@ import errno
 import multiprocessing
 import os
 import re
+import resource
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import ParallelEnv
 
+from forked import Forked
 from rcdsac_trl import train
+from rcdsac_trl.cli import fail
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.run_config import CHECKPOINTS
 from rcdsac_trl.errors import TrainingError, UserInputError
@@ -252,40 +255,31 @@ def test_a_real_limit_on_files_ends_a_run_in_one_sentence(tmp_path: Path, backen
 
     TensorBoard's thread cannot end the run itself.
     """
-    program = (
-        "import resource, sys\n"
-        "from pathlib import Path\n"
-        "from tiny import tiny_trainer\n"
-        "from rcdsac_trl import cli\n"
-        "from rcdsac_trl.errors import TrainingError\n"
-        "given = ['checkpoint.every_iterations=1', f'logger.backends=[{sys.argv[2]}]']\n"
-        "trainer = tiny_trainer(Path(sys.argv[1]), 'rcdsac_pow', *given)\n"
-        "save = trainer.checkpoints.save\n"
-        "def limited(progress, logs):\n"
-        "    path = save(progress, logs)\n"
-        "    resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)\n"
-        "    return path\n"
-        "trainer.checkpoints.save = limited\n"
-        "try:\n"
-        "    trainer.run()\n"
-        "except TrainingError as error:\n"
-        "    cli.fail(error)\n"
-    )
     run = tmp_path / "run"
-    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
-    ended = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program, str(run), backends, str(limit_bytes)],
-        env=os.environ | {"PYTHONPATH": path, "RL_LOGGING_LEVEL": "WARNING"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert ended.returncode == 1, ended.stderr
+
+    def program() -> None:
+        warnings.simplefilter("ignore")
+        trainer = tiny_trainer(run, "rcdsac_pow", "checkpoint.every_iterations=1", f"logger.backends=[{backends}]")
+        save = trainer.checkpoints.save
+
+        def limited(progress: Progress, logs: Any) -> Path:
+            path = save(progress, logs)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes,) * 2)
+            return path
+
+        trainer.checkpoints.save = limited  # type: ignore[method-assign]
+        try:
+            trainer.run()
+        except TrainingError as error:
+            fail(error)
+
+    ended = Forked(program, tmp_path / "said")
+    assert ended.code() == 1, ended.said
     told = (
         r"rcdsac_trl: a file became larger than this system or its limits allow \(.*File too large\): training stops "
         rf"in iteration 1; 0 iterations are saved, resume={run} continues there\n"
     )
-    assert re.fullmatch(told, ended.stderr), ended.stderr
+    assert re.fullmatch(told, ended.said), ended.said
     saved, damaged = newest(run / CHECKPOINTS, replay=run / "replay")
     assert (saved.progress.iterations, damaged) == (0, [])
 

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from itertools import count
@@ -21,6 +20,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_checkpoint import DAMAGE
 from torchrl.checkpoint import Checkpoint
 
+import killable
+from forked import Forked
 from rcdsac_trl import train
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import Progress, folders, newest
@@ -53,31 +54,34 @@ class Server:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.numbers = count()
-        path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).parents[1] / "killable.py"), json.dumps(RUN)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "RL_LOGGING_LEVEL": "WARNING"},
-        )
+        (jobs, self.jobs), (self.answers, answers) = (map(os.fdopen, os.pipe(), "rw") for _ in range(2))
+
+        def program() -> None:
+            self.jobs.close()  # else its jobs would never end
+            killable.serve(jobs, answers, RUN)
+
+        self.process = Forked(program, folder / "said")
+        jobs.close()
+        answers.close()
 
     def call(self, do: str, run: Path, *, kill_at: tuple[str, int] | None = None, **changes: Any) -> Counted | None:
         """Train or resume; return how many events of each kind happened, or None if it was killed."""
         job = {"row": "rcdsac_pow", "overrides": RUN, "evaluate": [], "told": ["beta=[-1]"]} | changes
         out = self.folder / f"job{next(self.numbers)}"
         job |= {"do": do, "folder": str(run), "kill_at": kill_at, "out": str(out)}
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        print(json.dumps(job), file=self.process.stdin, flush=True)
-        status = int(self.process.stdout.readline())
+        print(json.dumps(job), file=self.jobs, flush=True)
+        answer = self.answers.readline()
+        assert answer, self.process.said
+        status = int(answer)
         if kill_at is not None and status == -signal.SIGKILL:
             return None
         assert status == 0, out.with_suffix(".log").read_text()
         return json.loads(out.read_text())  # type: ignore[no-any-return]
 
     def close(self) -> None:
-        self.process.communicate()
+        self.jobs.close()
+        assert self.process.code() == 0, self.process.said
+        self.answers.close()
 
 
 @pytest.fixture(scope="module")

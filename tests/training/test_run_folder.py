@@ -4,41 +4,25 @@ import errno
 import fcntl
 import json
 import os
-import subprocess
 import sys
+import time
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import yaml
 
+from forked import Forked
+from rcdsac_trl import train
 from rcdsac_trl.config.compose import output_folder
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import newest
+from rcdsac_trl.training import run_folder
 from tiny import AGENTS, ITERATIONS, TINY, tiny_trainer
 
 START = ["+algo=rcdsac_pow", *TINY]
-
-# Waits where nothing speaks against the folder yet until the other one has come as far.
-STARTER = """
-import sys, time
-from pathlib import Path
-from rcdsac_trl import train
-from rcdsac_trl.training import run_folder
-
-mine, other = Path(sys.argv.pop(1)), Path(sys.argv.pop(1))
-check_folder = run_folder.check_folder
-
-def checked_by_both(folder):
-    check_folder(folder)
-    mine.touch()
-    while not other.exists():
-        time.sleep(0.01)
-
-run_folder.check_folder = checked_by_both
-train.main()
-"""
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -47,19 +31,25 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 def test_of_two_starts_in_one_folder_one_trains_and_the_other_leaves_no_trace(tmp_path: Path) -> None:
     run, flags = tmp_path / "run", [tmp_path / "first", tmp_path / "second"]
-    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-c", STARTER, *map(str, pair), *START, f"seed={seed}", f"hydra.run.dir={run}"],
-            env=os.environ | {"PYTHONPATH": path, "MALLOC_MMAP_MAX_": "0", "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for seed, pair in enumerate((flags, flags[::-1]))
-    ]
-    errors = [process.communicate(timeout=300)[1] for process in started]
-    codes = [process.returncode for process in started]
+
+    def start(seed: int) -> None:
+        """Train, but wait where nothing speaks against the folder yet until the other one has come as far."""
+        check_folder = run_folder.check_folder
+
+        def checked_by_both(folder: Path) -> None:
+            check_folder(folder)
+            flags[seed].touch()
+            while not flags[1 - seed].exists():
+                time.sleep(0.01)
+
+        run_folder.check_folder = checked_by_both
+        os.environ["MALLOC_MMAP_MAX_"] = "0"  # else the program would start itself again
+        sys.argv = ["train", *START, f"seed={seed}", f"hydra.run.dir={run}"]
+        train.main()
+
+    started = [Forked(partial(start, seed), tmp_path / f"said by {seed}") for seed in (0, 1)]
+    codes = [each.code() for each in started]
+    errors = [each.said for each in started]
     assert sorted(codes) == [0, 2], errors
     winner, loser = codes.index(0), codes.index(2)
     assert errors[loser] in (
