@@ -137,6 +137,8 @@ def test_nothing_is_decided_by_what_is_told(acting: ActingSettings) -> None:
         driven.append((betas, commands))
     (betas, plain), (betas_told, told) = driven
     assert betas == betas_told
+    controller = TailVarianceBeta(-2.0, 0.0)
+    assert betas[1:] != [controller(OPEN, command.quantiles) for command in told[:-1]]  # it would read another tail
     assert len(set(betas)) > 5
     for one, other in zip(plain, told, strict=True):
         decided = (one.v_m_per_s, one.omega_rad_per_s, one.wanted, one.reason)
