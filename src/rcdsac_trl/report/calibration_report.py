@@ -24,7 +24,7 @@ COVERED = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
 """Fractions whose coverage is tabulated."""
 TAIL = 0.1
 """Share of the worst returns that counts as the tail."""
-PIT_BINS = 10
+MOST_PIT_BINS = 10
 
 
 def coverage(quantiles: Array, returns: Array) -> Array:
@@ -52,6 +52,24 @@ def pit(quantiles: Array, returns: Array) -> Array:
         array([[0. , 0.5, 1. ]])
     """
     return (quantiles[:, None, :] < returns[:, :, None]).mean(-1)
+
+
+def pit_histogram(quantiles: Array, returns: Array) -> tuple[Array, Array]:
+    """Return the shares of the returns by their :func:`pit`, and the borders of its bins, as many as divide evenly.
+
+    A return that lies between the quantiles on either side of a border counts half on each, so that all shares are
+    equal if the predictions are true.
+
+    Example:
+        >>> q = np.array([[1.0, 3.0, 5.0, 7.0]])  # at 1/8, 3/8, 5/8, 7/8: an eighth lies below, a quarter between two
+        >>> pit_histogram(q, np.array([[0.0, 2.0, 2.0, 4.0, 4.0, 6.0, 6.0, 8.0]]))[0].tolist()
+        [0.25, 0.25, 0.25, 0.25]
+    """
+    number = quantiles.shape[1]
+    bins = max(bins for bins in range(1, MOST_PIT_BINS + 1) if number % bins == 0)
+    halves = pit(quantiles, returns)[..., None] + np.array([-0.25, 0.25]) / number
+    counts, edges = np.histogram(halves.clip(0.0, 1.0), bins=bins, range=(0.0, 1.0))
+    return counts / counts.sum(), edges
 
 
 def crossing_rate(quantiles: Array) -> float:
@@ -141,8 +159,8 @@ def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFr
         fractions = (np.arange(quantiles.shape[1]) + 0.5) / quantiles.shape[1]
         covered.plot(fractions, coverage(quantiles, realised), color=color, linewidth=1.9, label=label)
         covered.plot(fractions, coverage(quantiles, realised - error.mean()), color=color, linewidth=1.2, linestyle=":")
-        counts, edges = np.histogram(pit(quantiles, realised), bins=PIT_BINS, range=(0.0, 1.0))
-        transformed.stairs(counts / counts.sum(), edges, color=color, linewidth=1.9)
+        shares, edges = pit_histogram(quantiles, realised)
+        transformed.stairs(shares, edges, color=color, linewidth=1.9)
         predicted, real = quantiles.mean(1), realised.mean(1)
         means.scatter(predicted, real, s=22, color=color, marker=marker, alpha=0.75, linewidths=0)
         extremes += [*predicted, *real]
@@ -151,11 +169,11 @@ def calibration_figure(title: str, predictions: pd.DataFrame, returns: pd.DataFr
         shape.plot(fractions, around, color=color, linewidth=1.2, linestyle="--")
     style(covered, "coverage (dotted: after shifting the level)", "τ", "share of returns below Z_τ")
     style(transformed, "PIT: where returns lie among the quantiles", "share of quantiles below the return", "returns")
-    style(means, "mean return of a state, higher is better", "predicted", "earned by roll-outs")
+    style(means, "mean return of a state, higher is better", "predicted", "earned")
     style(shape, "around the predicted mean: Z_τ (dashed: returns)", "τ", "return, higher is better")
     covered.set(xlim=(0, 1), ylim=(0, 1))
     covered.plot([0, 1], [0, 1], color=FAINT, linewidth=1.2, linestyle="--", label="true quantiles")
-    transformed.axhline(1 / PIT_BINS, color=FAINT, linewidth=1.2, linestyle="--")
+    transformed.axhline(1 / len(shares), color=FAINT, linewidth=1.2, linestyle="--")
     transformed.set(xlim=(0, 1), ylim=(0, None))
     means.plot(limits(extremes), limits(extremes), color=FAINT, linewidth=1.2, linestyle="--")
     shape.set_xlim(0, 1)
@@ -209,9 +227,12 @@ def write_calibration(folder: Path) -> str:
     said, too; the latter as ``calibration-told.csv`` and ``.png``.
     """
     described, predictions, returns = _read(folder)
-    text = _write_table(folder, "calibration", described, predictions, returns)
+    what = f"{described['agent']}, sensor {described['sensor']}, {described['checkpoint']}"
+    title = f"{what}: predicted and real returns"
+    text = _write_table(folder, "calibration", title, described, predictions, returns)
     if (told := told_predictions(predictions)) is not None:
-        table = _write_table(folder, "calibration-told", described, told, returns)
+        title = f"{what}: returns as it tells them, recalibrated, and real ones"
+        table = _write_table(folder, "calibration-told", title, described, told, returns)
         text += f"\n\nas the agent tells it, recalibrated:\n{table}"
     # Folders of before it could be asked for do not mention it.
     if described.get("cross_evaluate", False):
@@ -220,12 +241,11 @@ def write_calibration(folder: Path) -> str:
 
 
 def _write_table(
-    folder: Path, name: str, described: dict[str, Any], predictions: pd.DataFrame, returns: pd.DataFrame
+    folder: Path, name: str, title: str, described: dict[str, Any], predictions: pd.DataFrame, returns: pd.DataFrame
 ) -> str:
     """Write a table and its figure, and return the table as text."""
     table = calibration_table(predictions, returns, described["gamma"], described["horizon_steps"])
     table.to_csv(folder / f"{name}.csv", index=False, float_format="%.6g")
-    title = f"{described['agent']}, sensor {described['sensor']}, {described['checkpoint']}: predicted and real returns"
     calibration_figure(title, predictions, returns).savefig(folder / f"{name}.png", dpi=130)
     return str(table.set_index("beta").T.to_string(float_format="%.3f"))
 
