@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,8 @@ from rcdsac_trl.deploy.policy.distortion import fractions_of
 from rcdsac_trl.deploy.policy.weights import read_weights
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.calibration import make_calibration
+from rcdsac_trl.evaluation.film import filming
+from rcdsac_trl.evaluation.film.recording import Moment
 from rcdsac_trl.release.agent_export import make_export
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.release.publication import make_publication
@@ -197,3 +200,25 @@ def test_offsets_of_another_agent_are_not_taken(run: Path, tmp_path: Path, capsy
     assert measured.told_calibration == ()
     assert "| tells |" not in (folder / "README.md").read_text()
     assert "it tells raw quantiles, for it has no calibration as driven on validation" in capsys.readouterr().out
+
+
+def test_a_film_shows_what_is_told(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    filmed: list[tuple[list[list[Moment]], list[list[Moment]]]] = []
+    original = filming.recorded
+
+    def both(*given: Any) -> list[list[Moment]]:
+        *drive, recalibration = given
+        filmed.append((original(*drive), original(*drive, recalibration)))
+        return filmed[0][1]
+
+    monkeypatch.setattr(filming, "recorded", both)
+    monkeypatch.setattr(filming, "write_video", lambda *_: [])
+    tiny.evaluate(f"run={published}", "beta=[-2,-1]", "record=true", f"out={tmp_path}")
+    recalibration = read_weights(published).config.recalibration
+    assert recalibration is not None
+    ((said, told),) = filmed
+    for beta, raw, shown in zip((-2.0, -1.0), said, told, strict=True):
+        for one, other in zip(raw, shown, strict=True):
+            assert one.quantiles is not None
+            assert other.quantiles == pytest.approx(np.sort(one.quantiles + recalibration.offsets_of(beta)), abs=1e-5)
+            assert one.scene.pose == other.scene.pose
