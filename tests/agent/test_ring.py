@@ -156,7 +156,7 @@ def test_weights_of_format_1_keep_their_reading(tmp_path: Path) -> None:
     assert (config.pop("memory_s"), config.pop("range_code")) == (0.0, "paper")  # of agents of formats 1 and 2
     unsaid_by_3 = config.pop("robot")["name"], config.pop("restart_steps"), config.pop("look_ahead")
     assert unsaid_by_3 == ("paper", None, False)
-    assert config.pop("acting")["num_candidates"] == 1
+    assert (config.pop("acting")["num_candidates"], config.pop("recalibration")) == (1, None)
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 1}))
     old = read_weights(tmp_path)
     assert old.config == weights.config

@@ -141,6 +141,7 @@ def test_weights_carry_how_they_act_and_those_of_before_act_by_the_mean(tmp_path
     # Those of before there was a margin do not say any.
     (tmp_path / "config.json").write_text(json.dumps(config | {"acting": {"num_candidates": 32, "spread": 2.0}}))
     assert Policy(read_weights(tmp_path)).acting == MANY
+    assert config.pop("recalibration") is None
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 4}))
     assert Policy(read_weights(tmp_path)).acting == BY_MEAN
 

@@ -65,7 +65,7 @@ def test_damage_is_refused_in_one_sentence(tmp_path: Path) -> None:
     config.write_text("[]")
     assert "cannot be read" in refusal()
     for key, value, told in [
-        ("format_version", 99, "is of format 99, this version reads 1 to 5"),
+        ("format_version", 99, "is of format 99, this version reads 1 to 6"),
         ("format_version", [4], "is of format [4], this version"),
         ("sensor", "wide", "sensor='wide' does not exist"),
         ("padding", "zeros", "neither 'circular' nor 'none'"),

@@ -74,8 +74,8 @@ def test_weights_of_before_drive_the_papers_robot(tmp_path: Path) -> None:
     for name, content in packed(agent()).items():
         (tmp_path / name).write_bytes(content)
     config = json.loads((tmp_path / "config.json").read_bytes())
-    assert config.pop("format_version") == FORMAT_VERSION == 5
-    del config["robot"], config["restart_steps"], config["look_ahead"], config["acting"]
+    assert config.pop("format_version") == FORMAT_VERSION == 6
+    del config["robot"], config["restart_steps"], config["look_ahead"], config["acting"], config["recalibration"]
     (tmp_path / "config.json").write_text(json.dumps(config | {"format_version": 3}))
     assert read_weights(tmp_path).config == agent().config
     for folder in shipped_agents().values():

@@ -104,7 +104,7 @@ def test_a_robot_is_driven_by_the_beta_of_its_controllers() -> None:
         command = policy.act(distances, AHEAD, STANDING, beta=beta)
         assert not command.stopped
         assert command.wanted == told.act(distances, AHEAD, STANDING, beta).wanted
-        quantiles = command.quantiles
+        quantiles = command.raw_quantiles
         betas.append(beta)
     assert betas[0] == -2.0  # something is near
     assert len(set(betas)) > 5

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scenes_to_play import drive
 
 from rcdsac_trl.agent.risk import MEASURES, CVaR, PowerLaw, make_measure
 from rcdsac_trl.playground.drivers import AgentDriver
+from rcdsac_trl.playground.page_words import _robot_words
 from rcdsac_trl.playground.view_state import (
     FINE,
     VALUES_A_SIDE,
@@ -101,6 +103,19 @@ def test_the_curve_and_the_value_of_every_action_agree_with_the_policy(agent: st
             assert expected is not None
             by_hand = float((expected * weights_of(driver.measure, beta, len(expected))).mean())
             assert values.values[row * FINE, column * FINE] == pytest.approx(by_hand, abs=1e-3)
+
+
+def test_it_is_said_of_a_curve_that_it_is_recalibrated() -> None:
+    with contextlib.closing(drive(agent="rcdsac_cvar-narrow")) as played:
+        (robot,) = played.robots
+        played.step()
+        assert isinstance(robot.driver, AgentDriver)
+        shown = robot_view(robot, robot.arena.scene(), None)
+        assert shown.returns is not None
+        assert shown.returns.recalibrated == robot.driver.policy.recalibrated
+        for told in (False, True):
+            words = _robot_words(replace(shown, returns=replace(shown.returns, recalibrated=told)))["value"]
+            assert words.endswith("(dashed), recalibrated" if told else "(dashed)")
 
 
 @pytest.mark.parametrize(("agent", "has_values"), [("sac-narrow", True), ("rcwr-narrow", True), ("dwa", False)])

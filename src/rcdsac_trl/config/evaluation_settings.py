@@ -31,6 +31,8 @@ Name = Literal["best", "last"] | int
 Section = TypeVar("Section", SensorSettings, TaskSettings, RobotSettings)
 
 _MOST_FPS = 120
+MOST_MISSING = 0.02
+"""Share of a discounted return that may lie beyond the horizon of a calibration as driven."""
 
 
 @dataclass(frozen=True)
@@ -274,6 +276,7 @@ class CalibrationSettings:
     run: str | None
     beta: tuple[float, ...] | None
     checkpoint: Name | None
+    half_precision: bool
     split: Literal["evaluation", "validation"]
     seed: int
     num_maps: int
@@ -281,15 +284,28 @@ class CalibrationSettings:
     num_rollouts: int
     horizon_steps: int | None
     cross_evaluate: bool
+    as_driven: bool
+    num_episodes: int
+    every_steps: int
+    acting: ActingOverride
     out: str | None
     num_workers: Workers
     threads: Threads
 
     def __post_init__(self) -> None:
-        """Refuse what is below its limit, and a cross-evaluation of nothing."""
+        """Refuse what is below its limit, what does not go together, and a cross-evaluation of nothing."""
         check_least("seed", self.seed, 0)
-        for key in ("num_maps", "num_states", "num_rollouts"):
+        for key in ("num_maps", "num_states", "num_rollouts", "num_episodes", "every_steps"):
             check_least(key, getattr(self, key), 1)
+        if self.as_driven and self.cross_evaluate:
+            raise UserInputError(
+                "as_driven=true drives whole episodes, and cross_evaluate=true branches off from states: leave one out"
+            )
+        if self.acting.given and not self.as_driven:
+            raise UserInputError(
+                f"acting.{next(iter(self.acting.given))} says how an agent acts, and here its actions are drawn: give "
+                "as_driven=true, too, or leave acting out"
+            )
         if self.cross_evaluate and self.num_maps < 2:
             raise UserInputError(
                 f"cross_evaluate=true gives intervals over maps, and num_maps={self.num_maps} has none: give at least 2"
@@ -310,6 +326,30 @@ class CalibrationSettings:
                 "met in it: shorten it, or leave it out for half of an episode"
             )
         return horizon
+
+    def check_missing(self, gamma: float, episode_steps: int) -> None:
+        """Refuse returns as driven of which the horizon cuts off too much: offsets fitted on them would be too low.
+
+        Raises:
+            UserInputError: if more than :data:`MOST_MISSING` is missing.
+        """
+        horizon = self.horizon_in(episode_steps)
+        if self.as_driven and gamma**horizon > MOST_MISSING:
+            enough = math.ceil(math.log(MOST_MISSING) / math.log(gamma)) if gamma < 1.0 else "more"
+            raise UserInputError(
+                f"horizon_steps={horizon} leaves out {gamma**horizon:.0%} of a return (gamma={gamma:g}), and "
+                f"as_driven=true allows {MOST_MISSING:.0%}: that takes {enough} steps, and episodes that are longer"
+            )
+
+    def acting_of(self, trained: TrainingSettings) -> ActingSettings:
+        """Return how the agent acts as driven: as its config says, with what was chosen in its place.
+
+        Raises:
+            UserInputError: if its heads read no margin.
+        """
+        acting = self.acting.of(trained.acting)
+        acting.check_heads(trained.network.look_ahead)
+        return acting
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,8 @@ def look_at_calibration(cfg: DictConfig) -> None:
     if settings.run is not None:
         trained = find_agent(settings.run).settings()
         settings.horizon_in(trained.task.episode_steps)
+        settings.check_missing(trained.learner.gamma, trained.task.episode_steps)
+        settings.acting_of(trained)
         check_maps(trained.map, trained.task.min_path_m, trained.robot.circumradius_m)
     _look_at_out(settings.out)
 

@@ -88,10 +88,11 @@ VERBS = {
         does="hold the quantiles that critics predict against returns really earned",
         examples={
             "run=runs/<folder>": "at the values of beta of its row",
-            "run=runs/<folder> beta=[-2,-1] num_maps=10": "at two values of beta, on fewer maps",
+            "run=runs/<folder> as_driven=true split=validation": "as it acts: `publish` makes told quantiles true",
             "run=runs/<folder> cross_evaluate=true num_maps=80 num_states=1 num_rollouts=32": "is each beta's policy "
             "the best by its own measure?",
         },
+        keys=("acting",),
     ),
     "draw_maps": Verb(
         does="draw maps with their waypoints",

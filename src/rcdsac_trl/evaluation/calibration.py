@@ -2,6 +2,8 @@
 
 import contextlib
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,11 +19,13 @@ from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import measure_states
 from rcdsac_trl.evaluation.cross_evaluation import cross_evaluate, cross_tables
+from rcdsac_trl.evaluation.driven_returns import driven_findings, driven_returns
 from rcdsac_trl.evaluation.measured_run import Findings, MeasuredRun
 from rcdsac_trl.release.named_agent import NamedAgent, named_agent
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows, evaluate_maps
-from rcdsac_trl.rollout.make_agent import packed_loss, unpacked_loss
+from rcdsac_trl.rollout.make_agent import packed, packed_loss, unpacked_loss
+from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec
 from rcdsac_trl.seeding import stream, torch_stream
 from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
@@ -30,6 +34,9 @@ from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.rules import RULES_VERSION
 from rcdsac_trl.world.task.world_settings import WorldSettings
+
+Measurer = tuple[Callable[[], AbstractContextManager[Drive]], Callable[[Rows], Findings]]
+"""What makes the driver of a process, and what makes tables of all rows."""
 
 
 def make_calibration(cfg: DictConfig) -> MeasuredRun:
@@ -40,22 +47,22 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
 
     Raises:
         UserInputError: for a missing run, critics without quantiles, a beta that is missing or outside its domain, a
-            horizon that leaves no room in an episode, a cross-evaluation of a single beta, more roll-outs
-            at once than the memory holds.
+            horizon that leaves no room in an episode or too much of a return out, a cross-evaluation of a single beta,
+            more simulations at once than the memory holds.
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is None:
         raise UserInputError(
             "name the agent whose critics are measured: run=<folder> of a run or an export, or a shipped agent"
         )
-    named = named_agent(settings.run, settings.checkpoint)
+    named = named_agent(settings.run, settings.checkpoint, half_precision=settings.half_precision)
     trained = named.settings
     if trained.algo.critic != "quantile":
         raise UserInputError(
             f"run={settings.run} has {trained.algo.critic} critics, which predict no quantiles: name an agent of "
             "another row"
         )
-    settings.horizon_in(trained.task.episode_steps)
+    settings.check_missing(trained.learner.gamma, trained.task.episode_steps)
     conditions = trained.algo.conditions(settings.beta, None)
     if settings.cross_evaluate and len(conditions) < 2:
         raise UserInputError(
@@ -63,17 +70,10 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
             "two or more to a risk-conditioned agent, such as beta=[0.25,1], or leave cross_evaluate out"
         )
     named.check()
-    loss = named.load_critics()
     processes = resolve_processes(settings.num_workers, settings.num_maps)
-    simulations = max(1, processes) * len(conditions) * settings.num_states * settings.num_rollouts
-    remedy = (
-        "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, give fewer values of beta, or end "
-        "other programs"
-    )
-    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
+    make, findings = (_as_driven if settings.as_driven else _branched)(settings, named, conditions, max(1, processes))
 
     def maps(watch: Watch) -> Generator[Rows, None, None]:
-        make = partial(_driver, settings, trained, conditions, packed_loss(loss))
         return evaluate_maps(make, settings.num_maps, processes, watch)
 
     return MeasuredRun(
@@ -85,14 +85,75 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         unit_steps=trained.task.episode_steps,
         processes=processes,
         measure=maps,
-        findings=partial(_findings, trained.algo.distortion.measure),
+        findings=findings,
     )
 
 
+def _branched(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition], sets: int) -> Measurer:
+    """Return what rolls out from states, and what makes tables of it.
+
+    Args:
+        settings: of the calibration.
+        named: the agent.
+        conditions: it is driven under.
+        sets: of simulations that there are at once.
+    """
+    loss = named.load_critics()
+    simulations = sets * len(conditions) * settings.num_states * settings.num_rollouts
+    remedy = (
+        "lower num_rollouts, num_states (and raise num_maps instead) or num_workers, give fewer values of beta, or end "
+        "other programs"
+    )
+    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
+    make = partial(_driver, settings, named.settings, conditions, packed_loss(loss))
+    return make, partial(_findings, named.settings.algo.distortion.measure)
+
+
+def _as_driven(
+    settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition], sets: int
+) -> Measurer:
+    """Return what drives whole episodes, and what makes tables of them; arguments as for :func:`_branched`."""
+    trained = named.settings
+    simulations = sets * len(conditions) * settings.num_episodes
+    remedy = "lower num_episodes or num_workers, give fewer values of beta, or end other programs"
+    resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
+    world = WorldSettings(
+        map_settings=trained.map,
+        task=trained.task,
+        sensor=trained.sensor.name,
+        memory_s=trained.sensor.memory_s,
+        robot=trained.robot,
+        num_agents=settings.num_episodes * len(conditions),
+        num_workers=0,  # a process drives whole maps
+    )
+    spec = EvaluationSpec(
+        trained=trained,
+        world=world,
+        conditions=conditions,
+        split=settings.split,
+        seed=settings.seed,
+        num_episodes=settings.num_episodes,
+        sampled=False,
+        device="cpu",
+        threads=_threads(settings),
+        acting=settings.acting_of(trained),
+    )
+    loss, average = named.load()
+    agent = Agent(packed(average.module), packed_loss(loss))
+    horizon_steps = settings.horizon_in(trained.task.episode_steps)
+    make = partial(driven_returns, spec, agent, every_steps=settings.every_steps, horizon_steps=horizon_steps)
+    return make, partial(driven_findings, named.recalibration)
+
+
+def _threads(settings: CalibrationSettings) -> int:
+    return 1 if settings.threads == "auto" else settings.threads
+
+
 def _default_out(settings: CalibrationSettings, named: NamedAgent, conditions: Sequence[Condition]) -> Path:
-    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{settings.num_states}"
-    if settings.cross_evaluate:
-        name += "-cross"
+    size = settings.num_episodes if settings.as_driven else settings.num_states
+    name = f"{settings.split}-seed{settings.seed}-{settings.num_maps}x{size}"
+    name += "-driven" if settings.as_driven else "-cross" if settings.cross_evaluate else ""
+    name += "".join(f"-{part}_{value}" for part, value in settings.acting.given.items())
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in conditions)
     return named.folder_of("calibration", f"{name}{contexts}")
 
@@ -111,10 +172,8 @@ def _described(settings: CalibrationSettings, named: NamedAgent, conditions: Seq
         "split": settings.split,
         "seed": settings.seed,
         "num_maps": settings.num_maps,
-        "num_states": settings.num_states,
-        "num_rollouts": settings.num_rollouts,
+        **(_described_as_driven if settings.as_driven else _described_branched)(settings, named),
         "horizon_steps": settings.horizon_in(trained.task.episode_steps),
-        "memory_steps": trained.learner.sequence_length,
         "gamma": trained.learner.gamma,
         "target_over_critics": trained.learner.target_over_critics,
         "conditions": [str(condition) for condition in conditions],
@@ -124,12 +183,32 @@ def _described(settings: CalibrationSettings, named: NamedAgent, conditions: Seq
     return described | ({"cross_evaluate": True} if settings.cross_evaluate else {})
 
 
+def _described_branched(settings: CalibrationSettings, named: NamedAgent) -> dict[str, Any]:
+    return {
+        "num_states": settings.num_states,
+        "num_rollouts": settings.num_rollouts,
+        "memory_steps": named.settings.learner.sequence_length,
+    }
+
+
+def _described_as_driven(settings: CalibrationSettings, named: NamedAgent) -> dict[str, Any]:
+    recalibration = named.recalibration
+    return {
+        "as_driven": True,
+        "num_episodes": settings.num_episodes,
+        "every_steps": settings.every_steps,
+        "acting": asdict(settings.acting_of(named.settings)),
+        "betas": [condition.beta for condition in named.settings.algo.conditions(settings.beta, None)],
+        "recalibration": None if recalibration is None else asdict(recalibration),
+    }
+
+
 @contextlib.contextmanager
 def _driver(
     settings: CalibrationSettings, trained: TrainingSettings, conditions: Sequence[Condition], weights: bytes
 ) -> Iterator[Drive]:
     """Make what predicts and rolls out on one map after another, in this process."""
-    runtime.set_threads(1 if settings.threads == "auto" else settings.threads)
+    runtime.set_threads(_threads(settings))
     loss = unpacked_loss(trained, weights)
     group = settings.num_states * settings.num_rollouts
     world = WorldSettings(

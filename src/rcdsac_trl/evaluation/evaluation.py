@@ -88,7 +88,8 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
 
     def film(folder: Path, rows: Rows) -> list[Path]:
         headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in spec.conditions]
-        return write_film(spec, agent(), settings.video, headings, folder)
+        recalibration = None if named is None else named.recalibration
+        return write_film(spec, agent(), settings.video, headings, folder, recalibration)
 
     out = Path(settings.out) if settings.out is not None else _default_out(settings, spec, named, num_maps)
     return MeasuredRun(

@@ -178,7 +178,8 @@ class AgentDriver:
         if self.policy.config.context != "beta":
             return command
         outlook = self.policy.foresee(dialled)
-        return replace(command, wanted=outlook.wanted, quantiles=outlook.quantiles, value=outlook.value)
+        told = {name: getattr(outlook, name) for name in ("wanted", "quantiles", "value", "raw_quantiles")}
+        return replace(command, **told)
 
 
 class PlannerDriver:

@@ -71,7 +71,10 @@ def _dial_words(robot: RobotView) -> dict[str, Any]:
 
 def _robot_words(robot: RobotView) -> dict[str, Any]:
     returns = robot.returns
-    value = "" if returns is None else f"mean {returns.mean:.1f} (dotted), at this β {returns.value:.1f} (dashed)"
+    value = ""
+    if returns is not None:
+        value = f"mean {returns.mean:.1f} (dotted), at this β {returns.value:.1f} (dashed)"
+        value += ", recalibrated" if returns.recalibrated else ""
     nothing = ""
     if robot.values is None and robot.wanted is not None:
         nothing = "A planner: it expects no return."

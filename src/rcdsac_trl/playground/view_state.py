@@ -52,6 +52,7 @@ class ReturnView:
         weights: that beta puts on each, [N]; their mean is 1.
         mean: of the return.
         value: its risk-adjusted value, the weighted mean.
+        recalibrated: whether the quantiles are more than what the critics say.
     """
 
     fractions: Array
@@ -59,6 +60,7 @@ class ReturnView:
     weights: Array
     mean: float
     value: float
+    recalibrated: bool
 
 
 @dataclass(frozen=True)
@@ -232,7 +234,8 @@ def return_view(robot: Robot) -> ReturnView | None:
     quantiles = command.quantiles.astype(np.float64)
     weights = weights_of(driver.measure, beta, len(quantiles))
     fractions = driver.policy.fractions.astype(np.float64)
-    return ReturnView(fractions, quantiles, weights, float(quantiles.mean()), float((quantiles * weights).mean()))
+    mean, value = float(quantiles.mean()), float((quantiles * weights).mean())
+    return ReturnView(fractions, quantiles, weights, mean, value, driver.policy.recalibrated)
 
 
 def value_view(robot: Robot) -> ValueView | None:

@@ -10,7 +10,8 @@ from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy.export.exported import LIMIT, betas_of, check_extra, differences, export_agent
 from rcdsac_trl.deploy.policy.weights import Weights, packed
 from rcdsac_trl.errors import FaultError, UserInputError
-from rcdsac_trl.release.named_agent import named_agent
+from rcdsac_trl.release.named_agent import RunAgent, named_agent
+from rcdsac_trl.release.quantile_offsets import with_offsets
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.progress import Work
 from rcdsac_trl.system.resources import check_writable
@@ -62,6 +63,8 @@ class Export:
         print(f"wrote {self.out}")
         if (acting := self.weights.config.acting).chooses:
             print(f"its programs act by tanh(mean); the choice among {acting.num_candidates} actions is Policy's alone")
+        if (recalibration := self.weights.config.recalibration) is not None:
+            print(f"its programs tell raw quantiles; Policy tells them {recalibration}")
         return found
 
 
@@ -76,6 +79,8 @@ def make_export(cfg: DictConfig) -> Export:
     assert settings.run is not None
     agent = named_agent(settings.run, settings.checkpoint)
     weights = settings.acting.in_weights(agent.weights())
+    if isinstance(agent, RunAgent):
+        weights = with_offsets(weights, agent.folder, agent.checkpoint)
     out = agent.out / "export" / agent.stem if settings.out is None else Path(settings.out)
     check_writable(out)
     if out.is_dir() and any(out.iterdir()):

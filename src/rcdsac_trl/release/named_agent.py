@@ -23,6 +23,7 @@ from rcdsac_trl.config.run_config import (
     settings_of_run,
 )
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.deploy.policy.registry import is_shipped
 from rcdsac_trl.deploy.policy.weights import WEIGHTS_NAME, Weights, halved, read_weights, stored
 from rcdsac_trl.errors import UserInputError
@@ -72,6 +73,11 @@ class NamedAgent(ABC):
     @abstractmethod
     def training(self) -> bytes | None:
         """The config of its training, as a file; None where there is none."""
+
+    @property
+    @abstractmethod
+    def recalibration(self) -> Recalibration | None:
+        """By what it tells the quantiles of the return; None: as its critics say them."""
 
     @abstractmethod
     def weights(self) -> Weights:
@@ -136,6 +142,10 @@ class RunAgent(NamedAgent):
         """The run's config."""
         return (self.folder / CONFIG_NAME).read_bytes()
 
+    @property
+    def recalibration(self) -> None:
+        """Nothing: what is published or exported of a run gets it."""
+
     def weights(self) -> Weights:
         """Read the averaged actor and the critics."""
         return self._shipped if self.half_precision else weights_of_run(self.folder, self.checkpoint)
@@ -176,7 +186,8 @@ class ExportedAgent(NamedAgent):
         """What it was trained with; how it acts may have been chosen when it was exported."""
         config = self.read.config
         settings = replace(settings_of_export(self.folder), acting=config.acting)
-        if agent_config(settings, settings.learner.num_critics, config.provenance) != config:
+        trained = agent_config(settings, settings.learner.num_critics, config.provenance)
+        if replace(trained, recalibration=config.recalibration) != config:  # which no training has
             raise UserInputError(f"{self.folder}: {TRAINING_NAME} is of another agent than the weights: export it anew")
         return settings
 
@@ -205,6 +216,11 @@ class ExportedAgent(NamedAgent):
         """What was exported with it."""
         path = self.folder / TRAINING_NAME
         return path.read_bytes() if path.is_file() else None
+
+    @property
+    def recalibration(self) -> Recalibration | None:
+        """What it was written with."""
+        return self.read.config.recalibration
 
     def weights(self) -> Weights:
         """Return what was read."""

@@ -7,21 +7,23 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy.policy.acting import ActingSettings
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.measured import Measured, measured_of
 from rcdsac_trl.deploy.policy.model_card import limits_of
-from rcdsac_trl.deploy.policy.registry import agent_name
 from rcdsac_trl.deploy.policy.weights import Weights, halved, packed, stored
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import RunAgent, named_agent
+from rcdsac_trl.release.quantile_offsets import driven_calibration, name_of, with_offsets
 from rcdsac_trl.release.rounding import check_rounding, largest_differences
 from rcdsac_trl.release.run_weights import weights_of_run
-from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.system.resources import check_writable
@@ -32,8 +34,10 @@ from rcdsac_trl.world.task.rules import TaskSettings
 _TABLES = ("config.yaml", "training_episodes.csv", "validation_episodes.csv", "csv/scalars/time/elapsed_s.csv")
 _EVALUATION = ("evaluation.json", "episodes.csv", "collisions.csv")
 
-Describe = Callable[[Path, Path | None], dict[str, Any]]
-"""Returns what an evaluation, and a calibration if there is one, say of an agent."""
+Tell = Callable[[NDArray[np.floating], float | None], NDArray[np.floating]]
+"""Returns what an agent tells where its critics say some quantiles at a beta."""
+Describe = Callable[[Path, Path | None, Path | None, Tell | None], dict[str, Any]]
+"""Returns what an evaluation, a calibration and one as driven, if there are such, say of an agent that tells so."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,7 @@ class Published:
         evaluation: folder of the evaluation that its card quotes.
         as_shipped: whether that drove the weights that ship.
         calibration: folder of the calibration that its card quotes; None where there is none.
+        driven: likewise, of a calibration as driven.
     """
 
     run: Path
@@ -57,6 +62,7 @@ class Published:
     evaluation: Path
     as_shipped: bool
     calibration: Path | None
+    driven: Path | None
 
     def measured(self, name: str, precision: Mapping[str, float], describe: Describe) -> Measured:
         """Return what is known of it.
@@ -66,7 +72,10 @@ class Published:
             precision: what rounding changed.
             describe: returns what the folders say.
         """
-        values = describe(self.evaluation, self.calibration)
+        recalibration = self.small.config.recalibration
+        values = describe(
+            self.evaluation, self.calibration, self.driven, None if recalibration is None else recalibration.tell
+        )
         told = values["protocol"]
         again = f"seed={told['seed']} num_maps={told['num_maps']} num_episodes={told['num_episodes']}"
         return measured_of(
@@ -121,7 +130,17 @@ class Publication:
             (self.weights / name).mkdir(parents=True, exist_ok=True)
             for file, content in files.items():
                 atomic.write(self.weights / name / file, content)
-            print(f"{name}: {sum(map(len, files.values())) / 1e6:.1f} MB, {_said(measured)}")
+            size = sum(map(len, files.values())) / 1e6
+            print(f"{name}: {size:.1f} MB, {_said(measured)}{_told(agent.small.config)}")
+
+
+def _told(config: AgentConfig) -> str:
+    """Say what an agent tells of its return."""
+    if config.critic == "scalar":
+        return ""
+    if config.recalibration is None:
+        return "; it tells raw quantiles, for it has no calibration as driven on validation maps"
+    return f"; its quantiles are {config.recalibration}"
 
 
 def _said(measured: Measured) -> str:
@@ -147,15 +166,16 @@ def make_publication(cfg: DictConfig) -> Publication:
                 "run folder"
             )
         weights = settings.acting.in_weights(weights_of_run(run, settings.checkpoint))
+        weights = with_offsets(weights, run, settings.checkpoint)
         config = weights.config
-        robot = None if config.robot == PAPER else config.robot.name
-        name = agent_name(config.name, config.fixed_beta, config.sensor, robot)
+        name = name_of(config)
         if name in agents:
             raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
         small = halved(weights)
         evaluation, as_shipped = _evaluation_of(run, settings.checkpoint, _digest(small), config.acting)
         calibration = _calibration_of(run, settings.checkpoint)
-        agents[name] = Published(run, weights, small, agent.training, evaluation, as_shipped, calibration)
+        driven = driven_calibration(run, settings.checkpoint, weights, "evaluation")
+        agents[name] = Published(run, weights, small, agent.training, evaluation, as_shipped, calibration, driven)
     for folder in (Path(settings.weights), Path(settings.results)):
         check_writable(folder)
         for name in agents:
@@ -234,6 +254,8 @@ def _calibration_of(run: Path, checkpoint: Name) -> Path | None:
     found = {}
     for path in sorted(run.glob("calibration/*/calibration.json")):
         described = json.loads(path.read_bytes())
+        if described.get("as_driven", False):
+            continue
         if (described["checkpoint"], described["split"]) == (checkpoint, "evaluation"):
             found[path.parent] = described["num_maps"] * described["num_states"] * described["num_rollouts"]
     return max(found, key=lambda folder: found[folder]) if found else None

@@ -1,7 +1,9 @@
 """What is measured of an agent, as the numbers that its card, lists and tables are made from."""
 
+import contextlib
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,23 +11,30 @@ import pandas as pd
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import findings
-from rcdsac_trl.report.calibration_report import COVERED, calibration_of
+from rcdsac_trl.report.calibration_report import COVERED, Tell, calibration_of, driven_calibration_of
 from rcdsac_trl.report.collision_report import of_episodes
 from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.statistics import CONFIDENCE
 from rcdsac_trl.report.table import row_label
 
+_TOLD = (0.05, 0.5, 0.95)
+"""Fractions whose coverage a card quotes of the quantiles that an agent tells."""
 
-def measured_values(evaluation: Path, calibration: Path | None = None) -> dict[str, Any]:
+
+def measured_values(
+    evaluation: Path, calibration: Path | None = None, driven: Path | None = None, tell: Tell | None = None
+) -> dict[str, Any]:
     """Return what was measured of an agent, as plain values.
 
     Args:
         evaluation: a folder that ``evaluate`` wrote, of an agent or a baseline under fixed conditions.
         calibration: a folder that ``calibrate`` wrote; None: there is none.
+        driven: one that ``calibrate as_driven=true`` wrote.
+        tell: how the agent recalibrates what its critics say; None: it does not.
 
     Returns:
-        The entries of ``measured.json`` that follow from the two: `row`, `conditions`, `protocol`, `rules_version`,
-        `map_version`, `confidence`, `train_seed`, `commit` and `calibration`. See
+        The entries of ``measured.json`` that follow from them: `row`, `conditions`, `protocol`, `rules_version`,
+        `map_version`, `confidence`, `train_seed`, `commit`, `calibration` and `told_calibration`. See
         :class:`rcdsac_trl.deploy.policy.measured.Measured`.
 
     Raises:
@@ -44,6 +53,7 @@ def measured_values(evaluation: Path, calibration: Path | None = None) -> dict[s
         "train_seed": described["train_seed"],
         "commit": described["commit"],
         "calibration": [] if calibration is None else _calibration(calibration),
+        "told_calibration": [] if driven is None else _told_calibration(driven, tell),
     }
 
 
@@ -76,10 +86,8 @@ def _conditions(evaluation: Path) -> list[dict[str, Any]]:
 
 
 def _calibration(folder: Path) -> list[dict[str, Any]]:
-    try:
+    with _readable(folder):
         table = calibration_of(folder)
-    except (OSError, ValueError, KeyError) as error:
-        raise UserInputError(f"{folder} cannot be read ({error}): calibrate again into another folder") from error
     return [
         {
             "beta": _number(row["beta"]),
@@ -90,6 +98,38 @@ def _calibration(folder: Path) -> list[dict[str, Any]]:
         }
         for _, row in table.iterrows()
     ]
+
+
+def _told_calibration(folder: Path, tell: Tell | None) -> list[dict[str, Any]]:
+    with _readable(folder):
+        versions = driven_calibration_of(folder, tell)
+        described = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+    return [
+        {
+            "beta": _number(row["beta"]),
+            "told": name,
+            "num_maps": described["num_maps"],
+            "num_episodes": described["num_episodes"],
+            "seed": described["seed"],
+            "states": int(row["states"]),
+            "earned": _number(row["discounted_reward"]),
+            "predicted": _number(row["predicted"]),
+            "tail_depth": _number(row["tail_depth"]),
+            "predicted_tail_depth": _number(row["predicted_tail_depth"]),
+            "coverage": {f"{fraction:g}": _number(row[f"coverage_{fraction:g}"]) for fraction in _TOLD},
+        }
+        for name, table in versions
+        for _, row in table.iterrows()
+    ]
+
+
+@contextlib.contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Say of a folder that cannot be read what to do."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError) as error:
+        raise UserInputError(f"{folder} cannot be read ({error}): calibrate again into another folder") from error
 
 
 def _number(value: Any) -> float | None:

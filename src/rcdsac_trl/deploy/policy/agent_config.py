@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
+from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.look_ahead import foreseen_among, read_by_heads, told_of_action
 from rcdsac_trl.robot.observation import RangeCode, vector_observations
@@ -53,6 +54,8 @@ class AgentConfig:
             :mod:`rcdsac_trl.robot.look_ahead`.
         robot: that it was trained to drive; plain values of one, as files have them, are read.
         acting: how it acts, by tanh(mean) or by its critics' choice; plain values are read, too.
+        recalibration: by what it tells the quantiles of the return, fitted while it acted so; plain values are read,
+            too. None: it tells them as its critics say them.
 
     Raises:
         UserInputError: if values do not fit together.
@@ -79,6 +82,7 @@ class AgentConfig:
     look_ahead: bool = False
     robot: RobotSettings = PAPER
     acting: ActingSettings = BY_MEAN
+    recalibration: Recalibration | None = None
 
     def __post_init__(self) -> None:
         """Refuse what no agent can be."""
@@ -86,6 +90,8 @@ class AgentConfig:
             object.__setattr__(self, "robot", RobotSettings.from_mapping(self.robot))
         if not isinstance(self.acting, ActingSettings):
             object.__setattr__(self, "acting", ActingSettings(**self.acting))
+        if not isinstance(self.recalibration, Recalibration | None):
+            object.__setattr__(self, "recalibration", Recalibration(**self.recalibration))
         for name in ("context_range", "embedding", "period_s"):
             value = getattr(self, name)
             if value is None:
@@ -119,6 +125,8 @@ class AgentConfig:
         self.acting.check_heads(self.look_ahead)
         if self.critic not in ("quantile", "scalar"):
             raise UserInputError(f"critic={self.critic!r} is neither 'quantile' nor 'scalar'")
+        if self.critic == "scalar" and self.recalibration is not None:
+            raise UserInputError("critic='scalar' knows no quantiles that recalibration could shift")
         if set(self.network) != set(_WIDTHS) or not all(type(w) is int and w >= 1 for w in self.network.values()):
             raise UserInputError(f"network={dict(self.network)} does not give a positive width for each of {_WIDTHS}")
         if self.padding not in RING_ENDS:

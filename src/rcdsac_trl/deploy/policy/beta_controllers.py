@@ -1,8 +1,9 @@
 r"""Controllers that turn beta while an agent drives: bolder where there is room, more careful where there is none.
 
 Each is called once in every control period, *before* :meth:`rcdsac_trl.deploy.Policy.act`, with what the sensor says
-now and the quantiles of the command before, and returns the beta to drive with. A smaller beta is more averse, so
-``low`` is the most careful one that a controller uses, and ``high`` the boldest.
+now and the quantiles of the command before, and returns the beta to drive with: its ``raw_quantiles``, so that an agent
+that is recalibrated drives as the same agent without. A smaller beta is more averse, so ``low`` is the most careful one
+that a controller uses, and ``high`` the boldest.
 """
 
 import math
@@ -28,7 +29,7 @@ class BetaController(Protocol):
 
         Args:
             distances_m: of the range sensor, by sector, [180], ``inf`` where nothing is.
-            quantiles: of the return, of the command before, [N]; None where there are none.
+            quantiles: of the return, as the critics said them of the command before, [N]; None where there are none.
         """
 
 

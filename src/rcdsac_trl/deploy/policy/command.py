@@ -17,11 +17,13 @@ class Command:
         reason: why this is not what the agent wanted, and how that ends; None if it is.
         wanted: what the agent wanted, (m/s, rad/s); None where it was not asked.
         quantiles: of the return (the discounted sum of rewards from here on) for what the agent wanted, at
-            ``Policy.fractions``, the lower of the critics' each, float32 [N]; None where the agent was not asked,
-            or its critics know the mean alone.
-        value: mean of the return; None where the agent was not asked.
+            ``Policy.fractions``, the lower of the critics' each, recalibrated if ``Policy.recalibrated``, float32 [N];
+            None where the agent was not asked, or its critics know the mean alone.
+        value: mean of the return, of these quantiles; None where the agent was not asked.
         fresh: whether the agent was asked: False when it stopped, and between two of its periods.
         forgot: whether the memory was empty before this call.
+        raw_quantiles: as `quantiles`, but as the critics say them: what turns beta reads these, so that it does the
+            same whether an agent is recalibrated or not.
     """
 
     v_m_per_s: float
@@ -33,6 +35,7 @@ class Command:
     value: float | None = None
     fresh: bool = False
     forgot: bool = False
+    raw_quantiles: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,14 @@ class Outlook:
     Attributes:
         action: what it would do, or the action that was asked about, in [-1, 1], float32 [2].
         wanted: the velocities of that action, (m/s, rad/s).
-        quantiles: of the return for it, at ``Policy.fractions``, the lower of the critics' each, float32 [N]; None
-            where the critics know the mean alone.
-        value: mean of the return.
+        quantiles: of the return for it, at ``Policy.fractions``, the lower of the critics' each, recalibrated if
+            ``Policy.recalibrated``, float32 [N]; None where the critics know the mean alone.
+        value: mean of the return, of these quantiles.
+        raw_quantiles: as `quantiles`, but as the critics say them.
     """
 
     action: NDArray[np.float32]
     wanted: tuple[float, float]
     quantiles: NDArray[np.float32] | None
     value: float
+    raw_quantiles: NDArray[np.float32] | None

@@ -75,6 +75,10 @@ class Measured:
             (``tail_depth``), how far the critics say (``predicted_tail_depth``), and ``coverage``, by fraction the
             share of returns below that quantile. Empty where nobody looked.
         limits: sentences.
+        told_calibration: of what the agent tells while it drives as it acts, one entry a beta of what its critics say
+            (``told`` is ``"raw"``) and, where it recalibrates them, of that (``"recalibrated"``): maps, episodes, seed
+            and ``states``; means ``earned`` and ``predicted``; depths and ``coverage`` as above. Empty where nobody
+            looked.
     """
 
     row: str
@@ -91,6 +95,7 @@ class Measured:
     precision: Mapping[str, float] = field(default_factory=dict)
     calibration: tuple[Mapping[str, Any], ...] = ()
     limits: tuple[str, ...] = ()
+    told_calibration: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def num_episodes(self) -> int:
@@ -151,5 +156,5 @@ def measured_of(values: Mapping[str, Any]) -> Measured:
         )
         for condition in values["conditions"]
     )
-    lists = {name: tuple(values.get(name, ())) for name in ("calibration", "limits")}
+    lists = {name: tuple(values.get(name, ())) for name in ("calibration", "limits", "told_calibration")}
     return Measured(**{**values, **lists, "conditions": conditions})

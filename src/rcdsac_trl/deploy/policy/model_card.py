@@ -59,6 +59,7 @@ def model_card(config: AgentConfig, num_parameters: int, measured: Measured | No
         told += f"; it was trained for beta = {config.fixed_beta:g} alone"
     origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items() if value is not None)
     remembered = f", what it saw in the last {config.memory_s:g} s" if config.memory_s > 0.0 else ""
+    tells = "" if config.recalibration is None else f"| tells | quantiles of the return, {config.recalibration} |\n"
     driving = "" if measured is None else f"\n{driving_section(measured)}\n"
     sentences = limits_of(config) if measured is None else measured.limits
     limits = "\n".join(f"- {sentence}" for sentence in sentences)
@@ -81,7 +82,7 @@ policy = rcdsac_trl.load("this/folder")
 | risk measure | {config.measure} |
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |
 | acts by | {config.acting} |
-| gives | linear velocity in m/s, angular velocity in rad/s |
+{tells}| gives | linear velocity in m/s, angular velocity in rad/s |
 {origin}
 {driving}
 ## Limits
@@ -108,6 +109,13 @@ def driving_section(measured: Measured) -> str:
         parts.append(
             "What the critics expect, against returns really earned (all: true quantiles would show the fraction):\n\n"
             f"{_calibration_table(measured)}".rstrip()
+        )
+    if measured.told_calibration:
+        first = measured.told_calibration[0]
+        driven = f"{first['num_maps']} evaluation maps x {first['num_episodes']} episodes (seed {first['seed']})"
+        parts.append(
+            f"What it tells of its return while it drives, against what it earns on {driven}; raw is what its critics "
+            f"say:\n\n{_told_table(measured)}".rstrip()
         )
     return "\n\n".join(parts)
 
@@ -160,6 +168,22 @@ def _calibration_table(measured: Measured) -> str:
     ]
     covered = [f"returns below the quantile of {float(fraction):.0%}" for fraction in fractions]
     return markdown_table(["β", "depth of the worst tenth, expected", "earned", *covered], rows)
+
+
+def _told_table(measured: Measured) -> str:
+    rows = [
+        [
+            "all" if entry["beta"] is None else f"{entry['beta']:g}",
+            entry["told"],
+            f"{entry['predicted']:.1f} / {entry['earned']:.1f}",
+            f"{entry['predicted_tail_depth']:.1f} / {entry['tail_depth']:.1f}",
+            *(f"{share:.0%}" for share in entry["coverage"].values()),
+        ]
+        for entry in sorted(measured.told_calibration, key=lambda entry: (entry["beta"] or 0.0, entry["told"] != "raw"))
+    ]
+    covered = [f"below the {float(fraction):.0%} quantile" for fraction in measured.told_calibration[0]["coverage"]]
+    headings = ["β", "quantiles", "mean return, told / earned", "depth of the worst tenth, told / earned", *covered]
+    return markdown_table(headings, rows)
 
 
 def cell(estimate: Estimate, form: str) -> str:

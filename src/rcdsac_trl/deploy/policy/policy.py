@@ -123,6 +123,8 @@ class Policy:
         self.limits = limits
         self.navigator = navigator
         self.fractions = fractions_of(num_quantiles)
+        recalibration = self.config.recalibration
+        self._recalibration = None if recalibration is None else recalibration.at(self.fractions)
         context = self.config.context_range
         middle = None if context is None else (context[0] + context[1]) / 2.0
         self.default_beta = middle if self.config.context == "beta" else None
@@ -155,7 +157,7 @@ class Policy:
         self._last: Stamps | None = None
         self._last_fresh: Stamps | None = None
         self._wanted: tuple[float, float] | None = None
-        self._told: tuple[NDArray[np.float32] | None, float] | None = None
+        self._told: Outlook | None = None
         self._advice: Advice | None = None
         self._noise = stream(0, "drawn actions of a policy")
         if self.navigator is not None:
@@ -202,6 +204,14 @@ class Policy:
     def acting(self, acting: ActingSettings) -> None:
         self._choice = ActionChoice(acting, self.config, self._actor, self._critics) if acting.chooses else None
         self._acting = acting
+
+    @property
+    def recalibrated(self) -> bool:
+        """Whether the quantiles that it tells are what its critics say, shifted by ``config.recalibration``.
+
+        What it does follows from what they say.
+        """
+        return self._recalibration is not None
 
     @property
     def world(self) -> dict[str, Any]:
@@ -312,8 +322,9 @@ class Policy:
         """
         if self._steps == 0:
             raise UserInputError("nothing was seen since the memory was cleared: call act() first")
-        embedded = self._embedded(self.check_beta(beta))
-        return self._critics.of_actions(self._read[1:], np.asarray(actions, np.float32), embedded)
+        context = self.check_beta(beta)
+        lower = self._critics.of_actions(self._read[1:], np.asarray(actions, np.float32), self._embedded(context))
+        return self._tell(lower, context)
 
     def check_beta(self, beta: float | None) -> float | None:
         """Return what the agent is told for a `beta`, None where that is nothing.
@@ -448,7 +459,7 @@ class Policy:
             drawn = self._actor.action(self._read[0], self._embedded(context), noise)
         outlook = self._outlook(context, drawn)
         self._wanted = outlook.wanted
-        self._told = outlook.quantiles, outlook.value
+        self._told = outlook
         return outlook
 
     def _embedded(self, context: float | None) -> float | None:
@@ -468,9 +479,17 @@ class Policy:
         if action is None:
             action = self._chosen(context, embedded)
         lower = self._critics.values(self._read[1:], action, embedded)
-        quantiles = lower if self.config.critic == "quantile" else None
-        told = lower.tolist()  # of so few, Python's sum is the fastest mean
-        return Outlook(action, desired_velocities(action.tolist(), self.robot), quantiles, sum(told) / len(told))
+        told = self._tell(lower, context)
+        raw, quantiles = (lower, told) if self.config.critic == "quantile" else (None, None)
+        values = told.tolist()  # of so few, Python's sum is the fastest mean
+        velocities = desired_velocities(action.tolist(), self.robot)
+        return Outlook(action, velocities, quantiles, sum(values) / len(values), raw)
+
+    def _tell(self, lower: Array, context: float | None) -> Array:
+        """Return what is told where the critics say this, [.., N]."""
+        if self._recalibration is None:
+            return lower
+        return self._recalibration.tell(lower, context if self.config.context == "beta" else None)
 
     def _command(self, sectors: Sectors, measured: tuple[float, float], fresh: bool, forgot: bool) -> Command:
         assert self._wanted is not None
@@ -488,10 +507,10 @@ class Policy:
             v, omega, reason = self.guard.limit(v, omega, sectors, measured, been)
         # Networks are told what the robot was told: the limits are part of the world.
         self._commanded = (v, omega)
-        quantiles, value = self._told
+        quantiles, value, raw = self._told.quantiles, self._told.value, self._told.raw_quantiles
         if reason is not None:
             told = f"limited by {reason}; it ends when the cause does"
-        return Command(v, omega, False, told, self._wanted, quantiles, value, fresh, forgot)
+        return Command(v, omega, False, told, self._wanted, quantiles, value, fresh, forgot, raw)
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""

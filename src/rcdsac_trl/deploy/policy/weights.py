@@ -30,15 +30,17 @@ from rcdsac_trl.deploy.policy.registry import CONFIG_NAME
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import PAPER
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 """What is written. Earlier formats, which are read as well, do not say what all of their agents have in common."""
-_UNSAID_BY_4: dict[str, Any] = {"acting": BY_MEAN}
+_UNSAID_BY_5: dict[str, Any] = {"recalibration": None}
+_UNSAID_BY_4: dict[str, Any] = {"acting": BY_MEAN, **_UNSAID_BY_5}
 _UNSAID_BY_3: dict[str, Any] = {"restart_steps": None, "look_ahead": False, "robot": PAPER, **_UNSAID_BY_4}
 _UNSAID: dict[int, dict[str, Any]] = {
     1: {"padding": "none", "memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
     2: {"memory_s": 0.0, "range_code": "paper", **_UNSAID_BY_3},
     3: _UNSAID_BY_3,
     4: _UNSAID_BY_4,
+    5: _UNSAID_BY_5,
     FORMAT_VERSION: {},
 }
 WEIGHTS_NAME = "weights.safetensors"

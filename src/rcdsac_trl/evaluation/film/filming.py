@@ -9,6 +9,7 @@ from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.config.evaluation_settings import VideoSettings
+from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.evaluation.film.episode_film import Track, film
 from rcdsac_trl.evaluation.film.recording import Moment, Recorder
 from rcdsac_trl.evaluation.film.trajectories import trajectories
@@ -24,7 +25,12 @@ from rcdsac_trl.world.task.episode import draw_motor_steps
 
 
 def write_film(
-    spec: EvaluationSpec, agent: Agent | None, video: VideoSettings, headings: Sequence[str], folder: Path
+    spec: EvaluationSpec,
+    agent: Agent | None,
+    video: VideoSettings,
+    headings: Sequence[str],
+    folder: Path,
+    recalibration: Recalibration | None = None,
 ) -> list[Path]:
     """Drive the episodes of a map once more, film one under every condition, and draw the trajectories.
 
@@ -36,11 +42,12 @@ def write_film(
         video: which episode is filmed.
         headings: one a condition.
         folder: takes the files.
+        recalibration: by which the agent tells the quantiles of its return.
 
     Returns:
         The files.
     """
-    tracks = recorded(spec, agent, video.map, video.episode)
+    tracks = recorded(spec, agent, video.map, video.episode, recalibration)
     motor_steps = draw_motor_steps(spec.world.task, spec.split, spec.seed, video.map, video.episode)
     named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]
     name = f"map{video.map}-episode{video.episode}"
@@ -53,7 +60,13 @@ def write_film(
     return [*films, folder / f"ways-{name}.png"]
 
 
-def recorded(spec: EvaluationSpec, agent: Agent | None, map_index: int, episode: int) -> list[list[Moment]]:
+def recorded(
+    spec: EvaluationSpec,
+    agent: Agent | None,
+    map_index: int,
+    episode: int,
+    recalibration: Recalibration | None = None,
+) -> list[list[Moment]]:
     """Drive a map, and return the moments of one episode under every condition."""
     rows = [block * spec.num_episodes + episode for block in range(len(spec.conditions))]
     predictor = None
@@ -62,7 +75,7 @@ def recorded(spec: EvaluationSpec, agent: Agent | None, map_index: int, episode:
     watching: list[Recorder] = []
 
     def watch(worker: RolloutWorker, policy: TensorDictModuleBase) -> Recorder:
-        watching.append(Recorder(policy, worker.env.agents, rows, predictor))
+        watching.append(Recorder(policy, worker.env.agents, rows, predictor, recalibration))
         return watching[0]
 
     actor, loss = (None, None) if agent is None else agent

@@ -1,0 +1,162 @@
+"""Offsets by which an agent tells true quantiles, fitted on how it drove: what leaves the machine has them.
+
+``calibrate as_driven=true split=validation`` of a run is what they are fitted on, and ``split=evaluation`` what they
+are checked on: offsets are never fitted on the maps that they are judged by.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from rcdsac_trl.config.command_line import assigned
+from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.deploy.policy.acting import ActingSettings
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
+from rcdsac_trl.deploy.policy.distortion import fractions_of
+from rcdsac_trl.deploy.policy.recalibration import Recalibration
+from rcdsac_trl.deploy.policy.registry import agent_name
+from rcdsac_trl.deploy.policy.weights import Weights, halved, stored
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import PAPER
+
+Array = NDArray[np.float64]
+
+# Of an offset, as files have it: returns differ by tens.
+_DIGITS = 3
+
+
+def fitted_offsets(quantiles: Array, returns: Array, fractions: Array) -> Array:
+    r"""Return what quantiles have to be shifted by, [N]: for each the empirical quantile of what it falls short by.
+
+    With R states, the smallest offset at which at least :math:`\tau_i R` of the returns lie at or below the shifted
+    quantile, so that exactly :math:`\lceil \tau_i R \rceil` do where no two fall short by the same.
+
+    Args:
+        quantiles: as critics say them, one row a state, [R, N].
+        returns: that were earned from there, [R].
+        fractions: of the quantiles, [N].
+
+    Example:
+        >>> fitted_offsets(np.zeros((4, 2)), np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.25, 0.75])).tolist()
+        [1.0, 3.0]
+    """
+    short = returns[:, None] - quantiles
+    pairs = zip(short.T, fractions, strict=True)
+    return np.array([np.quantile(column, tau, method="inverted_cdf") for column, tau in pairs])
+
+
+def fit_recalibration(folder: Path, agent: str) -> Recalibration:
+    """Return the offsets that a folder which ``calibrate as_driven=true`` wrote asks for.
+
+    Each beta gets its own: where an agent is averse, critics know less of the worst that comes of it.
+
+    Args:
+        folder: that was written.
+        agent: name by which the command that is noted calls it.
+
+    Raises:
+        UserInputError: if it holds another calibration, or one on other maps than validation's, or cannot be read.
+    """
+    described = _described(folder)
+    if not described.get("as_driven", False):
+        raise UserInputError(
+            f"{folder} holds returns of drawn actions: offsets are fitted on those of an agent as it acts, calibrate "
+            "with as_driven=true split=validation"
+        )
+    if described["split"] != "validation":
+        raise UserInputError(
+            f"{folder} was driven on {described['split']} maps, which offsets are checked on: calibrate with "
+            "split=validation to fit them"
+        )
+    try:
+        predictions, returns = (pd.read_csv(folder / name) for name in ("predictions.csv", "returns.csv"))
+        states = predictions.merge(returns, on=["beta", "map", "state"], validate="one_to_one")
+        said = states.filter(regex=r"^q\d+$").to_numpy(np.float64)
+        earned = states["discounted_reward"].to_numpy(np.float64)
+    except (OSError, ValueError, KeyError) as error:
+        raise UserInputError(f"{folder} cannot be read ({error}): calibrate again into another folder") from error
+    fractions = fractions_of(said.shape[1]).astype(np.float64)
+    betas = sorted(beta for beta in described["betas"] if beta is not None)
+    told = [np.isclose(states["beta"], beta) for beta in betas] or [np.ones(len(states), np.bool_)]
+    offsets = [fitted_offsets(said[met], earned[met], fractions).round(_DIGITS).tolist() for met in told]
+    return Recalibration(
+        fractions=tuple(fractions.tolist()),
+        betas=tuple(betas),
+        offsets=tuple(map(tuple, offsets)),
+        split=described["split"],
+        seed=described["seed"],
+        num_maps=described["num_maps"],
+        num_episodes=described["num_episodes"],
+        num_states=len(states),
+        horizon_steps=described["horizon_steps"],
+        command=_command(agent, described, betas),
+    )
+
+
+def _command(agent: str, described: Mapping[str, Any], betas: Sequence[float]) -> str:
+    keys = ("split", "seed", "num_maps", "num_episodes", "every_steps", "horizon_steps")
+    given = [assigned("run", agent), "as_driven=true", *(f"{key}={described[key]}" for key in keys)]
+    told = [f"beta=[{','.join(f'{beta:g}' for beta in betas)}]"] if betas else []
+    return " ".join(["python -m rcdsac_trl.calibrate", *given, *told])
+
+
+def driven_calibration(run: Path, checkpoint: Name, weights: Weights, split: str) -> Path | None:
+    """Return where a run's agent was calibrated as it drives, with most states; None where it was not.
+
+    It is of that checkpoint and these weights, and acted as they say. One of the weights as they ship, in half
+    precision, comes before one of those that were trained.
+
+    Args:
+        run: its folder.
+        checkpoint: of the agent.
+        weights: of the agent, in single precision.
+        split: of the maps that were driven.
+    """
+    digest = sha256(stored(halved(weights), half=True)).hexdigest()
+    found = {}
+    for path in sorted(run.glob("calibration/*/calibration.json")):
+        described = _described(path.parent)
+        if not described.get("as_driven", False) or (described["checkpoint"], described["split"]) != (
+            checkpoint,
+            split,
+        ):
+            continue
+        driven = described.get("weights_sha256")
+        if driven not in (None, digest) or ActingSettings(**described["acting"]) != weights.config.acting:
+            continue
+        number = described["num_maps"] * described["num_episodes"] * len(described["conditions"])
+        found[path.parent] = (driven == digest, number)
+    return max(found, key=lambda folder: found[folder]) if found else None
+
+
+def with_offsets(weights: Weights, run: Path, checkpoint: Name) -> Weights:
+    """Return a run's agent with the offsets that its calibration on validation maps asks for; as it is without one.
+
+    Args:
+        weights: of the agent, in single precision.
+        run: its folder.
+        checkpoint: of the agent.
+    """
+    folder = driven_calibration(run, checkpoint, weights, "validation")
+    if folder is None:
+        return weights
+    agent = name_of(weights.config)
+    return replace(weights, config=replace(weights.config, recalibration=fit_recalibration(folder, agent)))
+
+
+def name_of(config: AgentConfig) -> str:
+    """Return what an agent is called that is published."""
+    robot = None if config.robot == PAPER else config.robot.name
+    return agent_name(config.name, config.fixed_beta, config.sensor, robot)
+
+
+def _described(folder: Path) -> dict[str, Any]:
+    described: dict[str, Any] = json.loads((folder / "calibration.json").read_bytes())
+    return described
