@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rcdsac_trl.config.acting_override import ActingOverride
 from rcdsac_trl.deploy import ActingSettings, Policy, TailVarianceBeta, Weights
 from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.deploy.policy.weights import packed, read_weights
@@ -99,6 +100,19 @@ def test_a_policy_tells_what_its_critics_say_and_the_offsets_of_its_beta() -> No
     assert foreseen.value == pytest.approx(plain.foresee(-2.0).value + AT_2.mean(), rel=1e-5)
     (many,) = told.outlooks(foreseen.action[None], -2.0)
     assert many == pytest.approx(foreseen.quantiles, abs=1e-5)
+
+
+def test_an_agent_that_acts_otherwise_than_it_was_fitted_tells_raw_quantiles() -> None:
+    weights = telling(agent(), fitted())
+    other = ActingSettings(num_candidates=4)
+    assert ActingOverride(num_candidates=1).in_weights(weights) is weights
+    assert ActingOverride(num_candidates=4).in_weights(weights).config.recalibration is None
+    policy = Policy(weights, guard=None, acting=other)
+    command = policy.act(OPEN, AHEAD, STANDING, -2.0)
+    assert not policy.recalibrated
+    assert command.quantiles is command.raw_quantiles
+    policy.acting = weights.config.acting
+    assert policy.recalibrated
 
 
 def test_more_or_fewer_quantiles_take_what_lies_between() -> None:

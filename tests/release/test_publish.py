@@ -82,7 +82,7 @@ def test_what_was_measured_is_there_for_programs(evaluated: Path, tmp_path: Path
     folder = tmp_path / "weights" / "rcdsac_pow-narrow"
     measured = read_weights(folder).measured
     assert measured is not None
-    assert json.loads((folder / "measured.json").read_text())["format_version"] == 1
+    assert json.loads((folder / "measured.json").read_text())["format_version"] == 2
     episodes = read_episodes([tmp_path / "results" / "rcdsac_pow-narrow"])
     assert [condition.beta for condition in measured.conditions] == [-2.0, -1.0]
     for condition in measured.conditions:

@@ -45,7 +45,8 @@ class ActingOverride:
         return replace(own, **self.given)  # type: ignore[arg-type]
 
     def in_weights(self, weights: Weights) -> Weights:
-        """Return an agent that acts so."""
-        if not self.given:
+        """Return an agent that acts so; acting otherwise than before, it has no offsets of its quantiles."""
+        acting = self.of(weights.config.acting)
+        if acting == weights.config.acting:
             return weights
-        return replace(weights, config=replace(weights.config, acting=self.of(weights.config.acting)))
+        return replace(weights, config=replace(weights.config, acting=acting, recalibration=None))

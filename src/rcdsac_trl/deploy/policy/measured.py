@@ -9,7 +9,7 @@ from typing import Any
 from rcdsac_trl.errors import UserInputError
 
 MEASURED_NAME = "measured.json"
-MEASURED_VERSION = 1
+MEASURED_VERSION = 2
 """Of the file's format."""
 
 
@@ -139,8 +139,8 @@ def read_measured(folder: Path) -> Measured | None:
     try:
         values = json.loads(text)
         version = values.pop("format_version")
-        if version != MEASURED_VERSION:
-            raise ValueError(f"it is of format {version}, this version reads {MEASURED_VERSION}")
+        if version not in range(1, MEASURED_VERSION + 1):
+            raise ValueError(f"it is of format {version}, this version reads 1 to {MEASURED_VERSION}")
         return measured_of(values)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise UserInputError(

@@ -123,8 +123,6 @@ class Policy:
         self.limits = limits
         self.navigator = navigator
         self.fractions = fractions_of(num_quantiles)
-        recalibration = self.config.recalibration
-        self._recalibration = None if recalibration is None else recalibration.at(self.fractions)
         context = self.config.context_range
         middle = None if context is None else (context[0] + context[1]) / 2.0
         self.default_beta = middle if self.config.context == "beta" else None
@@ -204,12 +202,15 @@ class Policy:
     def acting(self, acting: ActingSettings) -> None:
         self._choice = ActionChoice(acting, self.config, self._actor, self._critics) if acting.chooses else None
         self._acting = acting
+        # Offsets were fitted while it acted as its config says: acting otherwise it earns something else.
+        fitted = self.config.recalibration if acting == self.config.acting else None
+        self._recalibration = None if fitted is None else fitted.at(self.fractions)
 
     @property
     def recalibrated(self) -> bool:
         """Whether the quantiles that it tells are what its critics say, shifted by ``config.recalibration``.
 
-        What it does follows from what they say.
+        So only while it acts as ``config.acting``, and what it does follows from what they say.
         """
         return self._recalibration is not None
 
