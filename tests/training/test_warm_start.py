@@ -14,12 +14,13 @@ from torchrl.objectives import LossModule
 import tiny
 from rcdsac_trl import train
 from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import settings_of_run, training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.storage.checkpoint import load_states
-from rcdsac_trl.storage.checkpoint_record import load_progress
+from rcdsac_trl.storage.checkpoint_record import Saved, find, load_progress
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.setup import make_trainer, resume_training
 from rcdsac_trl.training.trainer import StopTraining, Trainer
@@ -149,6 +150,24 @@ def test_a_run_that_goes_on_is_the_runs_in_every_key_and_is_continued_bit_for_bi
     whole, halves = (load_states(tmp_path / name / "checkpoints", "last")[1] for name in ("whole", "halves"))
     assert whole["loss"].keys() == halves["loss"].keys()
     assert all(torch.equal(value, halves["loss"][name]) for name, value in whole["loss"].items())
+
+
+def test_the_run_that_goes_on_is_the_one_that_was_checked(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Path] = []
+
+    def noted(folder: Path, name: Name) -> tuple[Saved, list[str]]:
+        asked.append(folder)
+        return find(folder, name)
+
+    # Still training, it may have saved another checkpoint by the second look.
+    monkeypatch.setattr("rcdsac_trl.training.warm_start.find", noted)
+    begun(tiny_run, tmp_path / "run")
+    resumed = resume_training(tmp_path / "run")
+    assert resumed is not None
+    closed(resumed)
+    assert asked == [tiny_run / "checkpoints"] * 2
 
 
 def test_in_another_world_or_without_its_replay_a_run_begins_with_less(tiny_run: Path, tmp_path: Path) -> None:

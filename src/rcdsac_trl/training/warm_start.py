@@ -61,6 +61,11 @@ def ended_run(settings: TrainingSettings) -> EndedRun | None:
     return EndedRun(found.path, find(found.path / CHECKPOINTS, "last")[0])
 
 
+def inherited_steps(settings: TrainingSettings, ended: EndedRun | None) -> int:
+    """Return how many steps the replay of a new run begins with: those of the run that it goes on from."""
+    return 0 if ended is None else ended.replay_episodes * settings.task.episode_steps
+
+
 def go_on(learner: Learner, settings: TrainingSettings, ended: EndedRun) -> str:
     """Give a learner all that a run has learnt and learns from, and say in a sentence what it was not given.
 
