@@ -152,22 +152,28 @@ def test_a_run_that_goes_on_is_the_runs_in_every_key_and_is_continued_bit_for_bi
     assert all(torch.equal(value, halves["loss"][name]) for name, value in whole["loss"].items())
 
 
-def test_the_run_that_goes_on_is_the_one_that_was_checked(
+def test_a_run_that_trains_on_is_taken_as_it_was_when_it_was_checked(
     tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[Path] = []
+    looks: list[Saved] = []
 
-    def noted(folder: Path, name: Name) -> tuple[Saved, list[str]]:
-        asked.append(folder)
-        return find(folder, name)
+    def first_only(folder: Path, name: Name) -> tuple[Saved, list[str]]:
+        # Its first checkpoint was the last one at the first look; by the second there is another.
+        looks.append(find(folder, name if looks else 1)[0])
+        return looks[-1], []
 
-    # Still training, it may have saved another checkpoint by the second look.
-    monkeypatch.setattr("rcdsac_trl.training.warm_start.find", noted)
-    begun(tiny_run, tmp_path / "run")
-    resumed = resume_training(tmp_path / "run")
-    assert resumed is not None
-    closed(resumed)
-    assert asked == [tiny_run / "checkpoints"] * 2
+    monkeypatch.setattr("rcdsac_trl.training.warm_start.find", first_only)
+    trainer = begun(tiny_run, tmp_path / "run")
+    assert len(looks) == 1
+    assert_equal_states(trainer.learner.loss, named_agent(tiny_run, 1).load()[0])
+    assert {state["step"].item() for state in trainer.learner.optimizer.state.values()} == {tiny.UPDATES}
+    assert trainer.learner.replay.episodes_added == tiny.AGENTS
+    assert trainer.learner.replay.capacity_episodes == tiny.AGENTS * (1 + tiny.ITERATIONS)
+    assert trainer.progress.skipped_maps == 1
+    again = resume_training(tmp_path / "run")
+    assert again is not None
+    closed(again)
+    assert [look.progress.iterations for look in looks] == [1, 2]
 
 
 def test_in_another_world_or_without_its_replay_a_run_begins_with_less(tiny_run: Path, tmp_path: Path) -> None:
