@@ -15,7 +15,7 @@ from rcdsac_trl.config.run_config import training_settings
 from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.seeding import torch_stream
-from rcdsac_trl.training import setup
+from rcdsac_trl.training import make_learner as training_learner
 from rcdsac_trl.training.learner import Learner
 
 EPISODES = 20
@@ -24,7 +24,7 @@ EPISODES = 20
 def make_learner(algo: str, overrides: list[str], device: str = "cpu") -> Learner:
     """Make the learner of a training, its replay filled with random episodes of the configured sensor."""
     settings = training_settings(compose("train", [f"+algo={algo}", *overrides, "replay.capacity_steps=20000"]))
-    learner = setup.make_learner(settings, device)
+    learner = training_learner.make_learner(settings, device)
     mask = torch.from_numpy(sensor_mask(settings.sensor.name))
     vectors = vector_observations(settings.sensor.memory_s)
     learner.replay.add_episodes(random_episodes(EPISODES, settings.task.episode_steps, mask, vectors))

@@ -65,7 +65,7 @@ def collected(overrides: list[str], batches: int, *, wall: bool) -> float:
     from rcdsac_trl.config.run_config import training_settings
     from rcdsac_trl.rollout.make_collector import make_episodes
     from rcdsac_trl.storage.checkpoint_record import Progress
-    from rcdsac_trl.training.setup import make_learner
+    from rcdsac_trl.training.make_learner import make_learner
 
     given = ["+algo=rcdsac_pow", "schedule.pursuit_iterations=0", *overrides]
     settings = training_settings(compose("train", given))

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from rcdsac_trl.cli import entry_point, late
@@ -44,9 +45,10 @@ def sweep_or_continue(overrides: list[str], multirun: bool) -> bool:
 )
 def main(cfg: DictConfig) -> None:
     """Train one agent; the run folder is Hydra's output folder."""
-    from rcdsac_trl.training.setup import given_overrides, make_trainer, run_folder
+    from rcdsac_trl.training.setup import make_trainer
 
-    _run(make_trainer(cfg, run_folder(), given_overrides()))
+    job = HydraConfig.get()
+    _run(make_trainer(cfg, Path(job.runtime.output_dir), list(job.overrides.task)))
 
 
 def _run(trainer: "Trainer") -> None:

@@ -12,7 +12,7 @@ from rcdsac_trl.agent.risk import PowerLaw
 from rcdsac_trl.rollout.environments import environment, rollout_worker
 from rcdsac_trl.rollout.make_agent import make_policy
 from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
-from rcdsac_trl.training.setup import make_learner
+from rcdsac_trl.training.make_learner import make_learner
 from tiny import tiny_settings
 
 AGENTS = 2

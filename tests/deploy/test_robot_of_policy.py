@@ -24,10 +24,10 @@ from rcdsac_trl.deploy.policy.registry import shipped_agents
 from rcdsac_trl.deploy.policy.weights import FORMAT_VERSION, packed
 from rcdsac_trl.deploy.sensors.cloud import CameraPose
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot import guard as guards
 from rcdsac_trl.robot.range_sensor import LidarSettings
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Mount, mount_of_lidar
+from rcdsac_trl.robot.sensed_distances import outline_distances
 from rcdsac_trl.world.sim.lidar import sector_distances
 from robots import AHEAD, OPEN, STANDING, agent
 
@@ -220,7 +220,7 @@ def test_distances_of_an_outline_are_those_of_all_its_points() -> None:
         nearest = rng.uniform(0.05, 1.0, 3)
         place, yaw = rng.uniform(-0.4, 0.4, 2), rng.uniform(-math.pi, math.pi)
         cos, sin = math.cos(yaw), math.sin(yaw)
-        found = guards._outline_distances(corners, place[None, None], np.array([[cos, sin]]), borders, nearest)[0, 0]
+        found = outline_distances(corners, place[None, None], np.array([[cos, sin]]), borders, nearest)[0, 0]
         turned = corners @ np.array([[cos, sin], [-sin, cos]]) + place
         outline = np.concatenate(
             [a + sides * (b - a) for a, b in zip(turned, np.roll(turned, -1, axis=0), strict=True)]

@@ -51,7 +51,8 @@ from rcdsac_trl.world.maps.shapes import Box
 from rcdsac_trl.world.office.building import make_office, polyline_m
 from rcdsac_trl.world.office.depth_cameras import Lens
 from rcdsac_trl.world.office.furniture import desk
-from rcdsac_trl.world.sim.simulation import Simulation, Touch
+from rcdsac_trl.world.sim.contact import Touch
+from rcdsac_trl.world.sim.simulation import Simulation
 from robots import DSAC, SAC, agent
 from tiny import yaml_of
 

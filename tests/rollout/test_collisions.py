@@ -10,7 +10,7 @@ import pytest
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.rollout.collisions import COLLISION_COLUMNS, COLLISIONS, collision_table, diagnose
 from rcdsac_trl.world.maps.shapes import Box, Cylinder, Map, Mover
-from rcdsac_trl.world.sim.simulation import Touch
+from rcdsac_trl.world.sim.contact import Touch
 
 PERIOD_S = 0.14
 NARROW = sensor_mask("narrow")

@@ -17,7 +17,7 @@ from endless_drive import endless
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.rollout.evaluation_pool import Drive, EvaluationPool, Rows, evaluate_maps
 from rcdsac_trl.system.processes import WorkerError, resolve_processes, resolve_processes_beside
-from rcdsac_trl.training.setup import check_machine
+from rcdsac_trl.training.machine_check import check_machine
 from rcdsac_trl.world.task.env import make_env
 from tiny import tiny_settings
 

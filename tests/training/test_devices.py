@@ -10,7 +10,7 @@ from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.risk import PowerLaw
 from rcdsac_trl.agent.transforms import Relabel
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
-from rcdsac_trl.training.setup import make_replay
+from rcdsac_trl.training.make_learner import make_replay
 from tiny import tiny_settings
 
 

@@ -361,7 +361,7 @@ def test_networks_that_do_not_fit_leave_nothing_behind(tmp_path: Path, monkeypat
     def too_large(*_: object) -> None:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 51200000000 bytes.")
 
-    monkeypatch.setattr("rcdsac_trl.training.setup.make_loss", too_large)
+    monkeypatch.setattr("rcdsac_trl.training.make_learner.make_loss", too_large)
     with pytest.raises(RuntimeError, match="can't allocate"):
         tiny_trainer(tmp_path / "run")
     assert list(tmp_path.iterdir()) == []

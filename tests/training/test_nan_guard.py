@@ -13,8 +13,8 @@ from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.training.learner import Learner
-from rcdsac_trl.training.nan_guard import load_failure
-from rcdsac_trl.training.setup import reproduce_failure, resume_training
+from rcdsac_trl.training.nan_guard import load_failure, reproduce_failure
+from rcdsac_trl.training.setup import resume_training
 from rcdsac_trl.training.trainer import Trainer
 from tiny import ITERATIONS, TINY, tiny_settings, tiny_trainer
 

@@ -14,12 +14,13 @@ from torchrl.objectives import LossModule
 import tiny
 from rcdsac_trl import train
 from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import settings_of_run, training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.storage.checkpoint import load_states
-from rcdsac_trl.storage.checkpoint_record import load_progress
+from rcdsac_trl.storage.checkpoint_record import Saved, find, load_progress
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.setup import make_trainer, resume_training
 from rcdsac_trl.training.trainer import StopTraining, Trainer
@@ -149,6 +150,30 @@ def test_a_run_that_goes_on_is_the_runs_in_every_key_and_is_continued_bit_for_bi
     whole, halves = (load_states(tmp_path / name / "checkpoints", "last")[1] for name in ("whole", "halves"))
     assert whole["loss"].keys() == halves["loss"].keys()
     assert all(torch.equal(value, halves["loss"][name]) for name, value in whole["loss"].items())
+
+
+def test_a_run_that_trains_on_is_taken_as_it_was_when_it_was_checked(
+    tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[Saved] = []
+
+    def first_only(folder: Path, name: Name) -> tuple[Saved, list[str]]:
+        # Its first checkpoint was the last one at the first look; by the second there is another.
+        looks.append(find(folder, name if looks else 1)[0])
+        return looks[-1], []
+
+    monkeypatch.setattr("rcdsac_trl.training.warm_start.find", first_only)
+    trainer = begun(tiny_run, tmp_path / "run")
+    assert len(looks) == 1
+    assert_equal_states(trainer.learner.loss, named_agent(tiny_run, 1).load()[0])
+    assert {state["step"].item() for state in trainer.learner.optimizer.state.values()} == {tiny.UPDATES}
+    assert trainer.learner.replay.episodes_added == tiny.AGENTS
+    assert trainer.learner.replay.capacity_episodes == tiny.AGENTS * (1 + tiny.ITERATIONS)
+    assert trainer.progress.skipped_maps == 1
+    again = resume_training(tmp_path / "run")
+    assert again is not None
+    closed(again)
+    assert [look.progress.iterations for look in looks] == [1, 2]
 
 
 def test_in_another_world_or_without_its_replay_a_run_begins_with_less(tiny_run: Path, tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ def make_search(overrides: list[str]) -> "Search":
     trial = Job("", None, one.algo.name, one.sensor.name, one.seed, tuple(fixed), evaluate=None, folder=folder)
     search = Search(folder, settings, trial, searched)
 
-    from rcdsac_trl.training.setup import check_machine  # late: whatever needs no torch is told by then
+    from rcdsac_trl.training.machine_check import check_machine  # late: whatever needs no torch is told by then
 
     for trained in tried:
         check_machine(trained)

@@ -70,7 +70,7 @@ def make_sweep(overrides: list[str]) -> Sweep:
     jobs = [job for job, _ in found]
     _check_names(jobs)
 
-    from rcdsac_trl.training.setup import check_machine  # late: whatever needs no torch is told by then
+    from rcdsac_trl.training.machine_check import check_machine  # late: whatever needs no torch is told by then
 
     for _, trained in found:
         check_machine(trained)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.robot.guard import BLUR_M, LEAST_M, SHARES, STANDS_M_PER_S, STEP_S, Guard
+from rcdsac_trl.robot.guard import BLUR_M, LEAST_M, SHARES, Guard
 from rcdsac_trl.robot.sectors import Sectors
+from rcdsac_trl.robot.stopping_path import STANDS_M_PER_S, STEP_S
 from rcdsac_trl.system.jit import njit
 
 # What the compiled code is given of the definition: numba's cache notices no change of another file.

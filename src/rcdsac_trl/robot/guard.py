@@ -16,11 +16,11 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors, check_switches
+from rcdsac_trl.robot.sensed_distances import outline_distances, place_distances, sensed_within
+from rcdsac_trl.robot.stopping_path import STEP_S, stopping_paths
 
 # Shares of the wanted speed that are tried, the fastest first.
 SHARES = (1.0, 0.75, 0.5, 0.25)
-# Time from one place on the way to the next, s: 3 cm at full speed.
-STEP_S = 0.05
 # What is in a sector may be anywhere in it, so a wall beside the robot looks up to this much nearer farther on: who is
 # within the margin may seem to come so much nearer, but never below the least that must stay.
 BLUR_M = 0.01
@@ -49,14 +49,8 @@ _BESIDE_M = 0.004
 _EDGE = np.stack(
     (np.cos(np.arange(0.0, 2.0 * math.pi, math.pi / 12)), np.sin(np.arange(0.0, 2.0 * math.pi, math.pi / 12))), axis=1
 )
-# Below, the robot stands.
-STANDS_M_PER_S = 1e-9
 
-_ANGLES = np.arange(NUM_BINS) * BIN_RAD
-# Border i is the one between sectors i - 1 and i.
-_BORDERS = np.stack((np.cos(_ANGLES), np.sin(_ANGLES)))
-_SECTORS_BEFORE = np.arange(NUM_BINS) - 1
-_MIDDLES = (_ANGLES + math.pi) % (2.0 * math.pi) - math.pi + BIN_RAD / 2.0
+_MIDDLES = (np.arange(NUM_BINS) * BIN_RAD + math.pi) % (2.0 * math.pi) - math.pi + BIN_RAD / 2.0
 _AHEAD = np.abs(_MIDDLES) < _WAY_RAD
 _BEHIND = np.abs(_MIDDLES) > math.pi - _WAY_RAD
 
@@ -217,7 +211,8 @@ class Guard:
         borders, nearest = self._within_reach(sectors, max(abs(v), abs(moving[0])))
         if been is None and not len(nearest):
             return 1.0
-        places, headings = self._ways(v, omega, moving)
+        speeds = [share * v for share in SHARES]
+        places, headings = stopping_paths(speeds, omega, moving, self._reacting, self.robot)
         allowed = np.ones(len(SHARES), np.bool_)
         if len(nearest):
             clearance = self._clearances(places, headings, borders, nearest)
@@ -229,12 +224,8 @@ class Guard:
 
     def _within_reach(self, sectors: Sectors, speed: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the directions of what is in reach of who is never faster, [2, m], and how far it is, m, [m]."""
-        # Along a border, both sectors beside it are seen: whatever is inside a sector lies between its borders, at its
-        # distance or farther.
-        nearest = np.minimum(sectors.distances_m, sectors.distances_m[_SECTORS_BEFORE])
         # What is out of reach of the whole way cannot be near to any of it.
-        seen = nearest < self._reach(speed)
-        return _BORDERS[:, seen], nearest[seen]
+        return sensed_within(sectors, self._reach(speed))
 
     def _has_been(self, places: NDArray[np.float64], been: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return of which ways all places lie within where the robot has been, bool [shares].
@@ -264,8 +255,8 @@ class Guard:
             nearest: how far from here on there may be something, m, [m].
         """
         if self._is_a_disc:
-            return _distances(places, borders, nearest) - self.radius_m
-        return _outline_distances(self.robot.outline, places, directions, borders, nearest)
+            return place_distances(places, borders, nearest) - self.radius_m
+        return outline_distances(self.robot.outline, places, directions, borders, nearest)
 
     @property
     def _is_a_disc(self) -> bool:
@@ -283,129 +274,7 @@ class Guard:
             self.radius_m + self.margin_m + speed * (self.reaction_s + STEP_S) + self.robot.stopping_distance_m(speed)
         )
 
-    def _ways(
-        self, v: float, omega: float, moving: tuple[float, float]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the places the robot's centre comes by until it stands, itself first, for each share of `v`.
-
-        Returns:
-            Places [shares, n, 2], m; who stands before the others do stays where it is. And cosine and sine of the
-            heading there, [n, 2], which does not depend on the speed.
-        """
-        reacting = self._reacting
-        braking, turning = self.robot.max_acceleration_m_per_s2, self.robot.max_angular_acceleration
-        speeds = [_until_it_stands(share * v, moving[0], reacting, braking) for share in SHARES]
-        steps = max(len(of_share) for of_share in speeds)
-        covered_m = np.array([of_share + [0.0] * (steps - len(of_share)) for of_share in speeds]) * STEP_S
-        places = np.zeros((len(SHARES), steps + 1, 2))
-        on_the_way, headings = _directions(omega, moving[1], reacting, steps, turning)
-        np.cumsum(covered_m[:, :, None] * on_the_way, axis=1, out=places[:, 1:])
-        return places, headings
-
 
 def _check_robot(robot: object) -> None:
     if not isinstance(robot, RobotSettings):
         raise UserInputError(f"robot={robot!r} of the guard is none: give policy.robot, or a RobotSettings")
-
-
-def _until_it_stands(v: float, now: float, reacting: int, acceleration: float) -> list[float]:
-    """Return the linear velocity in each step: `v` is wanted in the first ones, and to stand from then on."""
-    speeds: list[float] = []
-    while len(speeds) < reacting or abs(now) > STANDS_M_PER_S:
-        now = _nearer(v if len(speeds) < reacting else 0.0, now, acceleration * STEP_S)
-        speeds.append(now)
-    return speeds
-
-
-def _directions(
-    omega: float, now: float, reacting: int, steps: int, acceleration: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return directions as cosine and sine: the mean one in each step, [steps, 2], and at its ends, [steps + 1, 2].
-
-    See :func:`_until_it_stands`.
-    """
-    yaw, directions, headings = 0.0, [], [(1.0, 0.0)]
-    for step in range(steps):
-        now = _nearer(omega if step < reacting else 0.0, now, acceleration * STEP_S)
-        half = now * STEP_S / 2.0
-        directions.append((math.cos(yaw + half), math.sin(yaw + half)))
-        yaw += 2.0 * half
-        headings.append((math.cos(yaw), math.sin(yaw)))
-    return np.array(directions), np.array(headings)
-
-
-def _nearer(wanted: float, now: float, change: float) -> float:
-    """Return the velocity after a step, as ``robot.action.clip_command`` has it, of one of the two alone."""
-    return now + change if wanted > now + change else now - change if wanted < now - change else wanted
-
-
-def _distances(
-    places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return how far each place is from what is sensed, m, [...].
-
-    Args:
-        places: [..., 2].
-        borders: directions of unit length, [2, m].
-        nearest: in each direction, how far from here on there may be something, m, [m].
-    """
-    along = places @ borders
-    point = np.maximum(along, nearest)
-    # |place - point u|^2 = |place|^2 + point (point - 2 place u) for a direction u, in few passes over large arrays.
-    along *= 2.0
-    np.subtract(point, along, out=along)
-    along *= point
-    squared = along.min(axis=-1) + np.square(places).sum(axis=-1)
-    return np.sqrt(np.maximum(squared, 0.0))
-
-
-def _outline_distances(
-    outline: NDArray[np.float64],
-    places: NDArray[np.float64],
-    headings: NDArray[np.float64],
-    borders: NDArray[np.float64],
-    nearest: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return how far a convex body is from what is sensed at each place, m, [shares, n]; 0 where they meet.
-
-    What is sensed in a direction is everything on the ray from `nearest` on. A ray and a convex body that do not meet
-    are nearest at the ray's beginning, or at one of the body's corners.
-
-    Args:
-        outline: corners of the body in its own frame, counter-clockwise, m, [k, 2].
-        places: of its centre, [shares, n, 2].
-        headings: cosine and sine of its heading there, [n, 2].
-        borders: directions of unit length, [2, m].
-        nearest: in each direction, how far from here on there may be something, m, [m].
-    """
-    cos, sin = headings[:, 0], headings[:, 1]
-    turns = np.stack((np.stack((cos, sin), axis=-1), np.stack((-sin, cos), axis=-1)), axis=1)  # [n, frame, map]
-    corners = places[:, :, None] + outline @ turns
-    at_corners = _distances(corners, borders, nearest).min(axis=-1)
-    # The rays in the body's frame, [shares, n, m, 2].
-    begin = np.einsum("nij,snmj->snmi", turns, (borders * nearest).T - places[:, :, None])
-    along = np.broadcast_to(np.einsum("nij,jm->nmi", turns, borders), begin.shape)
-    at_begin, met = _point_and_ray(outline, begin, along)
-    return np.where(met.any(axis=-1), 0.0, np.minimum(at_corners, at_begin.min(axis=-1)))
-
-
-def _point_and_ray(
-    outline: NDArray[np.float64], begin: NDArray[np.float64], along: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return how far the beginnings of rays [..., 2] are from a convex body, and whether the rays meet it, [...]."""
-    enters, leaves = np.zeros(begin.shape[:-1]), np.full(begin.shape[:-1], np.inf)
-    apart2 = np.full(begin.shape[:-1], np.inf)
-    for corner, following in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        side = following - corner
-        off = begin - corner
-        share = np.clip(off @ side / (side @ side), 0.0, 1.0)
-        apart2 = np.minimum(apart2, np.square(off - share[..., None] * side).sum(axis=-1))
-        # To the left of every side is inside: how far it is there, and how fast the ray gets farther in.
-        inside = side[0] * off[..., 1] - side[1] * off[..., 0]
-        rate = side[0] * along[..., 1] - side[1] * along[..., 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            crossing = -inside / rate
-        enters = np.where(rate > 0.0, np.maximum(enters, crossing), enters)
-        leaves = np.where(rate < 0.0, np.minimum(leaves, crossing), leaves)
-        leaves = np.where((rate == 0.0) & (inside < 0.0), -np.inf, leaves)
-    return np.sqrt(apart2), enters <= leaves

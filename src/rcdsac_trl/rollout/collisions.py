@@ -19,8 +19,8 @@ from rcdsac_trl.rollout.evaluation_pool import Rows
 from rcdsac_trl.rollout.measurement import CONDITION_COLUMNS
 from rcdsac_trl.world.maps.geometry import segment_clearance
 from rcdsac_trl.world.maps.shapes import Box, Cylinder, Map, solid_arrays
+from rcdsac_trl.world.sim.contact import Touch
 from rcdsac_trl.world.sim.lidar import sector_distances
-from rcdsac_trl.world.sim.simulation import Touch
 from rcdsac_trl.world.task.agent_group import AgentGroup
 
 COLLISIONS = "collision_rows"

@@ -9,9 +9,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, SoftUpdate
 
+from rcdsac_trl.config.run_config import settings_of_run
 from rcdsac_trl.errors import TrainingError
+from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.storage import atomic
 
 _BATCH = "batch.safetensors"
@@ -114,6 +116,18 @@ class FiniteGuard:
             f"{what} is NaN or infinite in iteration {self._iteration}: training stops; {folder} shows it again, "
             "and the last checkpoint is from before it"
         )
+
+
+def reproduce_failure(dump: Path) -> tuple[LossModule, TensorDict]:
+    """Make what shows a NaN or an infinity again: called with the batch, the loss returns what it returned then.
+
+    Args:
+        dump: a folder below ``failure/`` of a run folder.
+    """
+    settings = settings_of_run(dump.parents[1])
+    loss = make_loss(settings, "cpu")
+    SoftUpdate(loss, tau=settings.learner.target_coefficient)  # TorchRL warns of targets that nothing moves
+    return loss, load_failure(dump, loss)
 
 
 def load_failure(folder: Path, loss: LossModule) -> TensorDict:

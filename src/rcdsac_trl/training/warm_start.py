@@ -5,6 +5,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.named_folder import find_agent
 from rcdsac_trl.config.run_config import CHECKPOINTS, REPLAY
 from rcdsac_trl.config.training_settings import TrainingSettings
@@ -61,6 +62,11 @@ def ended_run(settings: TrainingSettings) -> EndedRun | None:
     return EndedRun(found.path, find(found.path / CHECKPOINTS, "last")[0])
 
 
+def inherited_steps(settings: TrainingSettings, ended: EndedRun | None) -> int:
+    """Return how many steps the replay of a new run begins with: those of the run that it goes on from."""
+    return 0 if ended is None else ended.replay_episodes * settings.task.episode_steps
+
+
 def go_on(learner: Learner, settings: TrainingSettings, ended: EndedRun) -> str:
     """Give a learner all that a run has learnt and learns from, and say in a sentence what it was not given.
 
@@ -70,7 +76,7 @@ def go_on(learner: Learner, settings: TrainingSettings, ended: EndedRun) -> str:
     Raises:
         UserInputError: if the run's networks are others.
     """
-    begin_with_agent(learner, settings)
+    begin_with_agent(learner, settings, ended.saved.progress.iterations)
     load_optimizer(ended.saved.path, learner.optimizer)
     left = ["random streams", "schedule"]
     if (damage := replay_segments.damage(ended.folder / REPLAY, ended.saved.segments)) is not None:
@@ -83,21 +89,28 @@ def go_on(learner: Learner, settings: TrainingSettings, ended: EndedRun) -> str:
     )
 
 
-def begin_with_agent(learner: Learner, settings: TrainingSettings) -> str:
+def begin_with_agent(learner: Learner, settings: TrainingSettings, checkpoint: Name = "last") -> str:
     """Give a learner the networks of the agent that ``init`` names, and say in a sentence what it was not given.
 
-    A run's are those of its last checkpoint: actor, averaged actor, critics, target critics and temperature. Of an
+    A run's are those of a checkpoint: actor, averaged actor, critics, target critics and temperature. Of an
     exported agent the averaged actor stands for the learning one, and its critics for their targets.
+
+    Args:
+        learner: that is given them.
+        settings: of the new run.
+        checkpoint: of a run; an exported agent has no choice.
 
     Raises:
         UserInputError: if there is no such agent, or its networks are not those of the run.
     """
     assert settings.init is not None
     is_run = find_agent(settings.init).is_run
-    agent = named_agent(settings.init, "last" if is_run else None)
+    agent = named_agent(settings.init, checkpoint if is_run else None)
     has_temperature = is_run or agent.weights().config.provenance.get(TEMPERATURE) is not None
     loss, average = agent.load()
-    state: dict[str, Tensor] = (agent.load_critics() if has_temperature else loss).state_dict()
+    if has_temperature and not is_run:
+        loss = agent.load_critics()
+    state: dict[str, Tensor] = loss.state_dict()
     if not is_run:
         state |= {
             f"{_TARGETS}{name.removeprefix(_CRITICS)}": value

@@ -15,7 +15,7 @@ from rcdsac_trl.world.maps.geometry import segment_clearance
 from rcdsac_trl.world.maps.shapes import solid_arrays
 from rcdsac_trl.world.office.building import Office
 from rcdsac_trl.world.office.furniture import Piece
-from rcdsac_trl.world.sim.simulation import Touch
+from rcdsac_trl.world.sim.contact import Touch
 
 COLLISION_COLUMNS = (
     "time_s",

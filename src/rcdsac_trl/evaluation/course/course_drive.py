@@ -21,7 +21,8 @@ from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.office.building import PERSON_HEIGHT_M, Office
 from rcdsac_trl.world.office.depth_cameras import DepthCameras, Lens
-from rcdsac_trl.world.sim.simulation import Simulation, StepResult, Touch
+from rcdsac_trl.world.sim.contact import Touch
+from rcdsac_trl.world.sim.simulation import Simulation, StepResult
 from rcdsac_trl.world.task.rules import collision_due
 
 Direction = Literal["forward", "reverse"]

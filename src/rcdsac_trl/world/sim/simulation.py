@@ -8,8 +8,7 @@ velocity away, and what is left is what the robot measures.
 
 import math
 import time
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,29 +18,15 @@ from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.generator import Map
-from rcdsac_trl.world.maps.geometry import outline_clearance, segment_clearance
+from rcdsac_trl.world.maps.geometry import segment_clearance
 from rcdsac_trl.world.sim import bodies
 from rcdsac_trl.world.sim.bullet import Client, check_display, pybullet
+from rcdsac_trl.world.sim.contact import CONTACT_DISTANCE_M, Contact, Touch, first_touch
 from rcdsac_trl.world.sim.lidar import NearSegments, scan
 from rcdsac_trl.world.sim.movers import Movers, WalkPlanner
 
 SIMULATION_BYTES = 28_000_000
 """Memory that PyBullet takes for a simulation, however empty; where there is none left, it ends the process."""
-CONTACT_DISTANCE_M = 1e-3
-"""A contact begins with something nearer to the robot's body than this.
-
-The solver lets a pushing robot rest within about 0.01 mm of a wall, on either side of it; with a limit of 0
-mm, leaning on a wall would read as a series of collisions.
-"""
-CONTACT_END_GAP_M = 0.005
-"""A contact can only end while nothing is within this gap of the circle around the robot's corners.
-
-Of the circle, not of the body: a robot that turns beside a wall touches it with one corner after the other, between
-which its flat sides are up to 19 mm away. The circle does not turn. Of a robot that is not nearly round, such as a
-rectangle, it is the body: its circle is far from its sides.
-"""
-CONTACT_END_S = 0.4
-"""A contact ends when the gap has been that wide at the end of every agent step for so long."""
 
 # Movers farther than this from touching the robot, and farther than both can come nearer in an agent step, which is
 # 0.2 m for the paper's robot, are moved in PyBullet only once an agent step.
@@ -59,35 +44,13 @@ class StepResult(NamedTuple):
         v_c: linear velocity along the robot's x axis, measured after contact, m/s.
         omega_c: angular velocity, measured after contact, rad/s.
         in_contact: whether the robot touched anything in any of the motor steps, or has not been clear of everything
-            for long enough since it did: see :data:`CONTACT_END_GAP_M` and :data:`CONTACT_END_S`.
+            for long enough since it did: see :mod:`rcdsac_trl.world.sim.contact`.
     """
 
     pose: tuple[float, float, float]
     v_c: float
     omega_c: float
     in_contact: bool
-
-
-class Touch(NamedTuple):
-    """How the robot touched something first in an agent step, as it stood when that was noticed.
-
-    Attributes:
-        x: where on the thing, map frame, m.
-        y: likewise.
-        mover: number of the mover that was touched; None: something that stands.
-        pose: the robot's x, y in m and yaw in rad.
-        v: linear velocity it drove with, before contact took any of it away, m/s.
-        omega: angular velocity likewise, rad/s.
-        motor_step: number of the motor step in the agent step, from 0.
-    """
-
-    x: float
-    y: float
-    mover: int | None
-    pose: tuple[float, float, float]
-    v: float
-    omega: float
-    motor_step: int
 
 
 class Simulation:
@@ -130,8 +93,7 @@ class Simulation:
         self._driven = (0.0, 0.0)  # velocities that the motor set last
         self._touch: Touch | None = None
         self._clearance_m = 0.0
-        self._in_contact = False
-        self._apart_steps = 0  # motor steps without anything near, since the last touch
+        self._contact = Contact(robot)
 
     def load(
         self,
@@ -184,7 +146,7 @@ class Simulation:
         self._v_c = self._omega_c = self._clearance_m = 0.0
         self._driven = (0.0, 0.0)
         self._touch = None
-        self._in_contact = False
+        self._contact.end()
 
     def _sense_circles(self, standing: NDArray[np.float64]) -> None:
         """Let the scan see circles that stand, float64 [n, 3], and all movers."""
@@ -324,50 +286,17 @@ class Simulation:
             omega_c = angular[2]
             if touchable and self._touch is None:
                 points = pybullet.getContactPoints(bodyA=body, physicsClientId=client)
-                if any(point[8] <= CONTACT_DISTANCE_M for point in points):
-                    self._touch = self._touch_at(points, before, motor_step)
+                if points:
+                    walking = [number for number, _ in self._mover_bodies]
+                    self._touch = first_touch(points, walking, before, motor_step)
             if self._gui:
                 time.sleep(robot.motor_period_s)
         self._pose = (x, y, math.remainder(yaw, 2.0 * math.pi))
         self._v_c, self._omega_c = v_c, omega_c
         self._driven = v, omega
-        self._follow_contact(self._touch is not None, motor_steps)
-        return StepResult(self._pose, v_c, omega_c, self._in_contact)
-
-    def _touch_at(
-        self, points: Sequence[Sequence[Any]], before: tuple[float, float, float, float, float], motor_step: int
-    ) -> Touch:
-        """Describe the deepest of PyBullet's contact points.
-
-        Args:
-            points: as a motor step found them; it looks for contact first, and then moves the robot.
-            before: pose before that step, and velocities that the motor set in the step before it. In that one PyBullet
-                already slows down what would else go through a thing.
-            motor_step: its number.
-        """
-        deepest = min(points, key=lambda point: point[8])
-        movers = [body for body, _ in self._mover_bodies]
-        body, (x, y, _) = deepest[2], deepest[6]
-        x_robot, y_robot, yaw, v, omega = before
-        pose = x_robot, y_robot, math.remainder(yaw, 2.0 * math.pi)
-        return Touch(x, y, movers.index(body) if body in movers else None, pose, v, omega, motor_step)
-
-    def _follow_contact(self, touched: bool, motor_steps: int) -> None:
-        """Let a contact begin with a touch, and end when nothing has been near for long enough."""
-        if touched:
-            self._in_contact, self._apart_steps = True, 0
-        elif self._in_contact:
-            self._apart_steps = self._apart_steps + motor_steps if self._is_apart() else 0
-            self._in_contact = self._apart_steps * self.robot.motor_period_s < CONTACT_END_S
-
-    def _is_apart(self) -> bool:
-        """Return whether nothing is within the gap in which a contact goes on."""
-        if not self.robot.is_round:
-            gap_m = outline_clearance(self.robot.outline, self._pose, self._boxes, self._circles, CONTACT_END_GAP_M)
-            return bool(gap_m >= CONTACT_END_GAP_M)
-        x, y, _ = self._pose
-        wide_m = self.robot.circumradius_m + CONTACT_END_GAP_M
-        return bool(segment_clearance(x, y, x, y, self._boxes, self._circles, wide_m) >= wide_m)
+        touched = self._touch is not None
+        in_contact = self._contact.after_step(touched, motor_steps, self._pose, self._boxes, self._circles)
+        return StepResult(self._pose, v_c, omega_c, in_contact)
 
     def scan(self) -> NDArray[np.float64]:
         """Return the exact smallest distance from the robot's centre in each 2-degree sector.
