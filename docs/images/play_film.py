@@ -51,8 +51,9 @@ class Shot:
 def find_shot() -> Shot:
     """Drive scenes without a page until one has what is to be shown."""
     offers = offers_of(read_config(compose("play", []), PlaySettings))
-    for seed in range(MOST_SEEDS):
-        scene = replace(usual_scene(offers), seed=seed)
+    usual = usual_scene(offers)
+    for seed in range(usual.seed, usual.seed + MOST_SEEDS):
+        scene = replace(usual, seed=seed)
         drive = Drive(scene, offers)
         contact = first_contact(drive)
         period_s = drive.period_s
