@@ -40,17 +40,20 @@ def test_afterwards_everything_is_as_before() -> None:
 
 @pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP])
 def test_what_ends_a_program_is_served_as_ctrl_c(ending: signal.Signals) -> None:
-    before = signal.getsignal(ending)
-    with endings_as_interrupts():
-        assert ended_by() is signal.SIGINT
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(ending)
-        assert ended_by() is ending
-        with at_safe_points():
-            signal.raise_signal(ending)  # waits
+    before = signal.signal(ending, signal.SIG_DFL)  # these tests may themselves run under nohup
+    try:
+        with endings_as_interrupts():
+            assert ended_by() is signal.SIGINT
             with pytest.raises(KeyboardInterrupt):
-                interruption_point()
-    assert signal.getsignal(ending) is before
+                signal.raise_signal(ending)
+            assert ended_by() is ending
+            with at_safe_points():
+                signal.raise_signal(ending)  # waits
+                with pytest.raises(KeyboardInterrupt):
+                    interruption_point()
+        assert signal.getsignal(ending) is signal.SIG_DFL
+    finally:
+        signal.signal(ending, before)
 
 
 def test_it_is_served_where_ctrl_c_is_ignored() -> None:
