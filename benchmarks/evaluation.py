@@ -1,7 +1,8 @@
-"""Seconds that an evaluation takes: 50 maps x 10 episodes x 1,000 steps with a real actor, on all cores.
+"""Seconds that an evaluation takes: 50 maps x 10 episodes x 1,000 steps with a real agent, on all cores.
 
-It runs the command's own code on an untrained agent, whose networks cost the same; one more map first starts the
-processes and is not counted. With fewer `--maps` the time is extrapolated linearly.
+It runs the command's own code on an untrained agent, whose networks cost the same, acting by tanh(mean), then by its
+critics' choice; two more maps first start the processes and are not counted. With fewer `--maps` the time is
+extrapolated linearly.
 """
 
 import tempfile
@@ -11,6 +12,7 @@ from pathlib import Path
 import bench_world as bench
 
 MAPS = 50
+CANDIDATES = 32
 
 
 def main() -> None:
@@ -23,27 +25,32 @@ def main() -> None:
     from rcdsac_trl.config.compose import compose
     from rcdsac_trl.evaluation.evaluation import make_evaluation
 
-    with tempfile.TemporaryDirectory() as folder:
-        run = untrained(Path(folder) / "run", options.overrides)
+    def seconds_per_map(run: Path, num_candidates: int) -> float:
         given = [
             f"run={run}",
             "checkpoint=last",
             "beta=[-1]",
+            f"acting.num_candidates={num_candidates}",
             f"num_workers={options.num_workers}",
             f"num_maps={options.maps + 2}",
         ]
         evaluation = make_evaluation(compose("evaluate", given))
         done = [time.perf_counter() for _ in evaluation.measure(lambda steps: None)]
-    # From the second map done, when every process of two is at work, to the last.
-    per_map = (done[-1] - done[1]) / options.maps
+        # From the second map done, when every process of two is at work, to the last.
+        return (done[-1] - done[1]) / options.maps
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = untrained(Path(folder) / "run", options.overrides)
+        by_mean, by_choice = (seconds_per_map(run, number) for number in (1, CANDIDATES))
     bench.report(
         {
             "cores": len(bench.cores()),
             "num_workers": options.num_workers,
             "maps_driven": options.maps,
             "extrapolated": options.maps != MAPS,
-            "seconds_for_500_episodes": per_map * MAPS,
-            "agent_steps_per_second": 10_000 / per_map,
+            "seconds_for_500_episodes": by_mean * MAPS,
+            "agent_steps_per_second": 10_000 / by_mean,
+            f"times_as_long_by_choice_among_{CANDIDATES}": by_choice / by_mean,
         },
         options,
     )

@@ -66,6 +66,7 @@ def test_evaluation(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     found = printed(capsys)
     assert found["extrapolated"]
     assert found["seconds_for_500_episodes"] > 0
+    assert found["times_as_long_by_choice_among_32"] > 0
 
 
 def test_deploy(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,12 +12,16 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from rcdsac_trl.agent.risk import PowerLaw
+from rcdsac_trl.agent.actor import build_critic
+from rcdsac_trl.agent.kernels import dispatch
+from rcdsac_trl.agent.kernels.compiled_values import CompiledValues
+from rcdsac_trl.agent.network_settings import NetworkSettings
+from rcdsac_trl.agent.risk import CVaR, PowerLaw, RiskMeasure
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy import Policy
 from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.release.run_weights import weights_of_run
-from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy
+from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy, LayerValues
 from rcdsac_trl.rollout.environments import rollout_worker
 from rcdsac_trl.rollout.make_agent import make_loss, make_policy
 from rcdsac_trl.rollout.policies import AgentNoise
@@ -121,6 +125,69 @@ def test_what_an_agent_chooses_does_not_depend_on_the_others() -> None:
             found = together(given.clone())["action"]
             for agent, other in enumerate(alone):
                 assert torch.equal(found[agent : agent + 1], other(given[agent : agent + 1].clone())["action"])
+
+
+# ----------------------------------------------------------------------------------------------- values of many actions
+FRACTIONS = (torch.arange(8) + 0.5) / 8.0
+
+
+def critic_head(kind: str, measure: RiskMeasure | None, look_ahead: bool) -> TensorDictModule:
+    torch.manual_seed(3)
+    network = NetworkSettings(head=48, look_ahead=look_ahead)
+    critic = build_critic(2, {"waypoint": 6, "remembered": 90}, kind, measure, network)  # type: ignore[arg-type]
+    return critic[1]  # type: ignore[no-any-return]
+
+
+def asked(number: int, head: TensorDictModule, measure: RiskMeasure) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what heads read, actions and betas of some agents."""
+    told = 2 if head.module.look_ahead is None else 4
+    memory = torch.rand(number, head.module.input.in_features - told)
+    betas = measure.low + (measure.high - measure.low) * torch.rand(number, 1)
+    return memory, 2.0 * torch.rand(number, 9, 2) - 1.0, betas
+
+
+@pytest.mark.parametrize("look_ahead", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "told", "measure"),
+    [
+        ("quantile", CVaR(), CVaR()),
+        ("quantile", PowerLaw(), PowerLaw()),
+        ("quantile", None, PowerLaw()),
+        ("scalar", None, CVaR()),
+    ],
+)
+def test_compiled_values_are_the_layers(
+    kind: str, told: RiskMeasure | None, measure: RiskMeasure, look_ahead: bool
+) -> None:
+    head = critic_head(kind, told, look_ahead)
+    assert dispatch.has_compiled_values(head.module)
+    compiled = CompiledValues(head.module, FRACTIONS, measure)
+    layers = LayerValues(head, FRACTIONS, measure)
+    memory, actions, betas = asked(4, head, measure)
+    with torch.no_grad():
+        found = compiled(memory, actions, betas, begins=True)
+        torch.testing.assert_close(found, layers(memory, actions, betas, begins=True))
+        assert found.std(1).min() > 1e-4  # else all actions are alike here
+        alone = [
+            compiled(*(each[row : row + 1] for each in (memory, actions, betas)), begins=False) for row in range(4)
+        ]
+        assert torch.equal(found, torch.cat(alone))
+
+        turned = betas.flip(0)
+        again = compiled(memory, actions, turned, begins=False)
+        torch.testing.assert_close(again, layers(memory, actions, turned, begins=False))
+        assert torch.equal(again, found) == (kind == "scalar")
+
+        head.module.output.weight.mul_(2.0)
+        torch.testing.assert_close(
+            compiled(memory, actions, turned, begins=False), layers(memory, actions, turned, begins=False)
+        )
+
+
+def test_the_layers_of_a_head_that_was_changed_are_asked() -> None:
+    head = critic_head("quantile", CVaR(), look_ahead=False)
+    head.module.hidden = nn.Sequential(head.module.hidden, nn.LayerNorm(48))
+    assert not dispatch.has_compiled_values(head.module)
 
 
 # ------------------------------------------------------------------------------------------------ a critic made by hand

@@ -149,10 +149,14 @@ class QuantileHead(nn.Module):
     def layers(self, memory: Tensor, action: Tensor, tau: Tensor, beta: Tensor | None) -> Tensor:
         """Do what follows beta's cosines and the look ahead, which is a part of the action here."""
         x = F.relu(self.input(torch.cat((memory, action), dim=-1)))
+        return self.output(F.relu(self.hidden(x.unsqueeze(2) * self.gates(tau, beta)))).squeeze(-1)
+
+    def gates(self, tau: Tensor, beta: Tensor | None) -> Tensor:
+        """Return what the features are multiplied with at each fraction, of beta's cosines, ``[B, L|1, N, head]``."""
         gate = self.gate_tau(self.cosines(tau))
         if beta is not None:
             gate = gate + self.gate_beta(beta).unsqueeze(2)
-        return self.output(F.relu(self.hidden(x.unsqueeze(2) * F.relu(gate)))).squeeze(-1)
+        return F.relu(gate)
 
 
 @made_in_float32

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from rcdsac_trl.agent.kernels import dispatch
+from rcdsac_trl.agent.kernels.compiled_values import CompiledValues
 from rcdsac_trl.agent.loss.distributional_sac import OVER_CRITICS
 from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.deploy.policy.acting import NUM_FRACTIONS, ActingSettings
@@ -47,15 +48,15 @@ class ChoosingPolicy(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
         self.policy = policy
-        self.measure = measure
         self._critics = critics
         self._steps = [dispatch.one_by_one(critic[0].module) for critic in critics]
+        tau = torch.from_numpy(fractions_of(NUM_FRACTIONS))
+        self._values = [_values_by(critic[1], tau, measure) for critic in critics]
         self._noise = torch.from_numpy(settings.noise())
         self._margin_m = settings.margin_m
         self._over = OVER_CRITICS[settings.over_critics]
-        self._tau = torch.from_numpy(fractions_of(NUM_FRACTIONS)).view(1, 1, -1)
-        self._beta = self._tau.new_full((num_agents, 1), beta or 0.0)
-        self._states = [self._tau.new_zeros(num_agents, critic[0].module.state_size) for critic in critics]
+        self._beta = tau.new_full((num_agents, 1), beta or 0.0)
+        self._states = [tau.new_zeros(num_agents, critic[0].module.state_size) for critic in critics]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -66,11 +67,13 @@ class ChoosingPolicy(TensorDictModuleBase):
         candidates[:, 0] = tensordict["action"]
         memories = self._remember(tensordict)
         betas = tensordict["risk"] if "risk" in self.policy.in_keys else self._beta
-        best = [
-            self._values([memory[agent] for memory in memories], candidates[agent], betas[agent]).argmax()
-            for agent in range(len(candidates))
+        begins = bool(tensordict["is_init"].any())
+        values = [
+            of_actions(memory, candidates, betas, begins=begins)
+            for of_actions, memory in zip(self._values, memories, strict=True)
         ]
-        return tensordict.set("action", candidates[torch.arange(len(best)), torch.stack(best)])
+        best = self._over(values).argmax(-1)
+        return tensordict.set("action", candidates[torch.arange(len(best)), best])
 
     def _remember(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Advance the critics by one observation, and return what their heads read, ``[N, n]`` each."""
@@ -81,18 +84,37 @@ class ChoosingPolicy(TensorDictModuleBase):
             memories.append(torch.from_numpy(nearer(memory.numpy(), self._margin_m)))
         return memories
 
-    def _values(self, memories: Sequence[Tensor], candidates: Tensor, beta: Tensor) -> Tensor:
-        """Return what the critics together say of an agent's candidates ``[K, 2]``, ``[K]``."""
-        risk = beta.view(1, 1, 1)
-        tau = self.measure.psi(self._tau, risk)
-        values = []
-        for (_, head), memory in zip(self._critics, memories, strict=True):
-            # As one sequence, whose gates are computed once. At this size its plain layers are faster than their twin.
-            entries = {
-                head.in_keys[0]: memory.expand(1, len(candidates), -1),
-                "action": candidates.unsqueeze(0),
-                "tau": tau,
-                "risk": risk,
-            }
-            values.append(head.module(*[entries[key] for key in head.in_keys])[0].mean(-1))
-        return self._over(values)
+
+class LayerValues:
+    """What any critic's head says of many actions of each agent, by its own layers; see :class:`.CompiledValues`.
+
+    Args:
+        head: reads `memory`, `action` and what it needs of `tau` and `risk`, all with a batch and a time dimension.
+        tau: the fractions, ``[F]``.
+        measure: distorts them.
+    """
+
+    def __init__(self, head: TensorDictModule, tau: Tensor, measure: RiskMeasure) -> None:
+        self._head, self._tau, self._measure = head, tau.view(1, 1, -1), measure
+
+    def __call__(self, memory: Tensor, actions: Tensor, risk: Tensor, *, begins: bool) -> Tensor:
+        """Return the values, ``[N, K]``; the layers' weights are always those of now, whatever begins."""
+        return torch.stack([self._of_agent(*row) for row in zip(memory, actions, risk, strict=True)])
+
+    def _of_agent(self, memory: Tensor, actions: Tensor, risk: Tensor) -> Tensor:
+        beta = risk.view(1, 1, 1)
+        # As one sequence, whose gates are computed once.
+        entries = {
+            self._head.in_keys[0]: memory.expand(1, len(actions), -1),
+            "action": actions.unsqueeze(0),
+            "tau": self._measure.psi(self._tau, beta),
+            "risk": beta,
+        }
+        of_agent: Tensor = self._head.module(*[entries[key] for key in self._head.in_keys])[0].mean(-1)
+        return of_agent
+
+
+def _values_by(head: TensorDictModule, tau: Tensor, measure: RiskMeasure) -> CompiledValues | LayerValues:
+    if dispatch.has_compiled_values(head.module):
+        return CompiledValues(head.module, tau, measure)
+    return LayerValues(head, tau, measure)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rcdsac_trl.agent.heads import ActorHead, CosineFeatures, LookAhead, QuantileHead, with_look_ahead
+from rcdsac_trl.agent.heads import ActorHead, CosineFeatures, LookAhead, QuantileHead, ScalarHead, with_look_ahead
 from rcdsac_trl.agent.kernels.compiled_encoder import CompiledEncoder
 from rcdsac_trl.agent.kernels.observation_features import observation_features
 from rcdsac_trl.agent.kernels.quantile_values import HeadLayers, quantile_values
@@ -68,6 +68,11 @@ def has_compiled_actor(encoder: nn.Module, head: nn.Module) -> bool:
     )
 
 
+def has_compiled_values(head: nn.Module) -> bool:
+    """Return whether :class:`~rcdsac_trl.agent.kernels.compiled_values.CompiledValues` knows a critic's head."""
+    return _is_plain_quantile_head(head) or _is_plain_scalar_head(head)
+
+
 def _is_ours(inputs: Sequence[Tensor | None]) -> bool:
     """Return whether kernels know the place of the inputs: a CPU, and nothing that wants to see the layers."""
     known = all(
@@ -109,8 +114,19 @@ def _is_plain_quantile_head(module: nn.Module) -> bool:
     if type(module) is not QuantileHead or type(module.cosines) is not CosineFeatures:
         return False
     gated = module.measure is None or type(module.gate_beta) is nn.Linear
-    gated = gated and (module.look_ahead is None or type(module.look_ahead) is LookAhead)
-    return gated and all(map(_is_linear, (module.input, module.gate_tau, module.hidden, module.output)))
+    return gated and _looks_ahead_plainly(module) and all(map(_is_linear, (*_layers(module), module.gate_tau)))
+
+
+def _is_plain_scalar_head(module: nn.Module) -> bool:
+    return type(module) is ScalarHead and _looks_ahead_plainly(module) and all(map(_is_linear, _layers(module)))
+
+
+def _looks_ahead_plainly(head: QuantileHead | ScalarHead) -> bool:
+    return head.look_ahead is None or type(head.look_ahead) is LookAhead
+
+
+def _layers(head: QuantileHead | ScalarHead) -> tuple[nn.Module, nn.Module, nn.Module]:
+    return head.input, head.hidden, head.output
 
 
 def _encode(encoder: Any, *inputs: Any) -> Tensor:
