@@ -2,13 +2,16 @@
 
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
 ``weights/``, and baselines of ``results/``, of which an evaluation is read. The comment of a table of the office course
-names the folder of what ``course`` wrote. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
+names the folder of what ``course`` wrote, that of a table of disturbances the files of ``docs/disturbances.py``, in
+their order. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
 
     <!-- agents: sac-narrow pursuit-narrow -->
     | agent | collisions | ..
     <!-- agents: end -->
     <!-- course: results/course -->
     <!-- course: end -->
+    <!-- disturbances: mppi -->
+    <!-- disturbances: end -->
 """
 
 import json
@@ -17,15 +20,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from rcdsac_trl.report.card import measured_values
 from rcdsac_trl.report.course_table import course_table
+from rcdsac_trl.report.statistics import compare
+
+Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 _TABLE = re.compile(r"(<!-- agents: (?!end)([^>]*?) -->\n).*?(<!-- agents: end -->)", re.S)
 _COURSE = re.compile(r"(<!-- course: (?!end)(\S+) -->\n).*?(<!-- course: end -->)", re.S)
+_DISTURBANCES = re.compile(r"(<!-- disturbances: (?!end)([^>]*?) -->\n).*?(<!-- disturbances: end -->)", re.S)
 _ACCELERATOR = re.compile(r"(<!-- accelerator: begin -->\n).*?(<!-- accelerator: end -->)", re.S)
 _COURSE_HEADINGS = (
     *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
@@ -38,6 +47,7 @@ def renewed(text: str) -> str:
     """Return a document with its tables as the measured numbers have them."""
     text = _TABLE.sub(lambda found: found[1] + table_of(found[2].split()) + found[3], text)
     text = _COURSE.sub(lambda found: found[1] + table_of_course(ROOT / found[2]) + found[3], text)
+    text = _DISTURBANCES.sub(lambda found: found[1] + table_of_disturbances(_driven(found[2].split())) + found[3], text)
     measured = ROOT / "results" / "accelerator.json"
     values = json.loads(measured.read_text(encoding="utf-8")) if measured.is_file() else None
     return _ACCELERATOR.sub(lambda found: found[1] + accelerator_table(values) + found[2], text)
@@ -67,6 +77,36 @@ def table_of_course(folder: Path) -> str:
                 cells.append(f"{row[f'{direction} {number}']} ({paper})" if paper else row[f"{direction} {number}"])
         rows.append(cells)
     return _markdown(_COURSE_HEADINGS, rows)
+
+
+def _driven(names: Sequence[str]) -> dict[str, pd.DataFrame]:
+    return {name: pd.read_csv(ROOT / "results" / "disturbances" / f"{name}.csv") for name in names}
+
+
+def table_of_disturbances(driven: Mapping[str, pd.DataFrame]) -> str:
+    """Return what disturbances cost, Markdown: a row a disturbance, the first of them none.
+
+    Args:
+        driven: of each name episodes, with their ``disturbance``, ``map``, ``collisions`` and ``reward``.
+    """
+    rows: dict[str, list[str]] = {}
+    for table in driven.values():
+        undisturbed = _by_map(table, "none")
+        for disturbance in table["disturbance"].unique():
+            found = _by_map(table, disturbance)
+            cells = [f"{found['collisions'].mean():.2f} / {found['reward'].mean():.0f}", ""]
+            if disturbance != "none":
+                more = compare(found["collisions"], undisturbed["collisions"]).difference
+                cells[1] = f"{more.value:+.2f} [{more.low:+.2f}, {more.high:+.2f}]"
+            rows.setdefault(disturbance, []).extend(cells)
+    headings = [heading for name in driven for heading in (name, "more collisions")]
+    return _markdown(["disturbance", *headings], [[disturbance, *cells] for disturbance, cells in rows.items()])
+
+
+def _by_map(table: pd.DataFrame, disturbance: str) -> dict[str, Floats]:
+    """Return collisions and reward of what was driven under a disturbance, [1, M, E]."""
+    rows = table[table["disturbance"] == disturbance].set_index(["map", "episode"])
+    return {name: rows[name].unstack("episode").to_numpy(float)[None] for name in ("collisions", "reward")}
 
 
 def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -1,5 +1,6 @@
 """The documents are true: their Python runs, their commands are accepted, what they name exists."""
 
+import itertools
 import json
 import os
 import re
@@ -8,10 +9,12 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
@@ -19,7 +22,10 @@ from rcdsac_trl import draw_maps
 from rcdsac_trl.agent.risk import MEASURES
 from rcdsac_trl.config.command_line import with_names
 from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.evaluation_settings import EvaluationSettings
+from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.verbs import VERBS
 from rcdsac_trl.experiments.optuna_search import make_search
 from rcdsac_trl.experiments.sweep_jobs import make_sweep
@@ -124,6 +130,31 @@ def test_the_table_of_the_course_is_what_was_driven(tmp_path: Path) -> None:
     # The paper's single runs: 0 collisions in 110 and 116 s.
     cells = "RC-DSAC pow | -2 | 1 of 2 | 2.5 ± 1.5 (0) | 110 ± 0 (110) | 2 of 2 | 0.0 ± 0.0 (0) | 98 ± 1 (116)"
     assert table(tmp_path).splitlines()[2] == f"| {cells} |"
+
+
+def test_the_table_of_disturbances_is_what_was_driven() -> None:
+    table = runpy.run_path(str(ROOT / "docs" / "tables.py"))["table_of_disturbances"]
+    columns = ["disturbance", "map", "episode", "collisions", "reward"]
+    # One more on either map: so it is in every resample.
+    driven = [("none", 0, 0, 1, 500), ("none", 1, 0, 2, 400), ("delay", 0, 0, 2, 300), ("delay", 1, 0, 3, 400)]
+    fewer = [("none", 0, 0, 3, 500), ("delay", 0, 0, 1, 500)]
+    lines = table({"a": pd.DataFrame(driven, columns=columns), "b": pd.DataFrame(fewer, columns=columns)}).splitlines()
+    assert lines[2:] == [
+        "| none | 1.50 / 450 |  | 3.00 / 500 |  |",
+        "| delay | 2.50 / 350 | +1.00 [+1.00, +1.00] | 1.00 / 500 | -2.00 [-2.00, -2.00] |",
+    ]
+
+
+def test_disturbances_change_the_world() -> None:
+    disturbances = runpy.run_path(str(ROOT / "docs" / "disturbances.py"))["DISTURBANCES"]
+
+    def world(changes: Sequence[str]) -> object:
+        settings = read_config(compose("evaluate", ["baseline=mppi", *changes]), EvaluationSettings)
+        return settings.world_of(default_training())
+
+    worlds = {name: world(changes) for name, changes in disturbances.items()}
+    assert worlds["none"] == world([])
+    assert all(first != second for first, second in itertools.combinations(worlds.values(), 2))
 
 
 def commands() -> list[tuple[str, str]]:
