@@ -1,7 +1,8 @@
-"""What a person should know before driving with an agent, as Markdown."""
+"""What a person should know before driving with an agent, as Markdown, and in a line."""
 
 from collections.abc import Mapping, Sequence
 
+from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.measured import Estimate, Measured
 from rcdsac_trl.robot.range_sensor import NUM_BINS
@@ -33,6 +34,30 @@ _ROUNDED = {
     "angular_speed_rad_per_s": "its angular speed by {} rad/s",
     "quantile": "its quantiles of the return by {}",
 }
+
+
+def summary(config: AgentConfig, acting: ActingSettings, measured: Measured | None) -> str:
+    """Return in a line what an agent is, how it acts, and what is known of how it drives."""
+    parts = [config.name, f"sensor {config.sensor}"]
+    if config.memory_s > 0.0:
+        parts.append(f"remembers {config.memory_s:g} s")
+    if config.context is not None and config.context_range is not None:
+        parts.append(f"{config.context} in [{config.context_range[0]:g}, {config.context_range[1]:g}]")
+    elif config.fixed_beta is not None:
+        parts.append(f"for beta={config.fixed_beta:g} alone")
+    parts.append(f"robot {config.robot.name}")
+    if acting.chooses:
+        parts.append(f"chooses among {acting.num_candidates} actions")
+    if measured is not None:
+        collisions, rewards = ([c.metrics[name].mean for c in measured.conditions] for name in ("collisions", "reward"))
+        parts.append(f"an episode: collisions {_span(collisions, 2)}, reward {_span(rewards, 0)}")
+    return ", ".join(parts)
+
+
+def _span(values: Sequence[float], digits: int) -> str:
+    """Write the smallest and the largest of some numbers, or the only one."""
+    low, high = (f"{value:.{digits}f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
 
 
 def limits_of(config: AgentConfig) -> tuple[str, ...]:

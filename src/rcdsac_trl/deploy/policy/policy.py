@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.acting import ActingSettings
-from rcdsac_trl.deploy.policy.action_choice import ActionChoice
 from rcdsac_trl.deploy.policy.command import Command, Outlook
+from rcdsac_trl.deploy.policy.context import bolder, context_of, middle_of_range
+from rcdsac_trl.deploy.policy.control_periods import ControlPeriods
 from rcdsac_trl.deploy.policy.distortion import fractions_of
-from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.policy.input_checks import (
     BadInputError,
     InputLimits,
@@ -23,41 +23,20 @@ from rcdsac_trl.deploy.policy.input_checks import (
     velocity_of,
     waypoints_of,
 )
+from rcdsac_trl.deploy.policy.model_card import summary
 from rcdsac_trl.deploy.policy.observed import observed
+from rcdsac_trl.deploy.policy.recurrent_networks import RecurrentNetworks
+from rcdsac_trl.deploy.policy.robot_observer import RobotObserver
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.guard import Guard
-from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.robot_settings import RobotSettings
-from rcdsac_trl.robot.sectors import Sectors, is_finite_number
+from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.seeding import stream
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator
-    from rcdsac_trl.robot.remembered_ranges import RememberedRanges
-
-# After so many calls without good input in a row, or so many of the longest periods of training without one, the memory
-# is of another situation.
-_FORGET_AFTER = 3
-_RECOVERS = "it stands until good input comes"
-_AT_ORIGIN = (0.0, 0.0, 0.0)
-
-
-def _span(values: Sequence[float], digits: int) -> str:
-    """Write the smallest and the largest of some numbers, or the only one."""
-    low, high = (f"{value:.{digits}f}" for value in (min(values), max(values)))
-    return low if low == high else f"{low} to {high}"
-
-
-def _memory_of(memory_s: float, sensed: NDArray[np.bool_], robot: RobotSettings) -> "RememberedRanges | None":
-    """Make what remembers for so long, if anything does; alone of all that drives a robot, that needs numba."""
-    if memory_s == 0.0:
-        return None
-    from rcdsac_trl.robot.remembered_ranges import RememberedRanges
-
-    return RememberedRanges(sensed, memory_s, robot)
 
 
 def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> Guard | None:
@@ -123,38 +102,17 @@ class Policy:
         self.limits = limits
         self.navigator = navigator
         self.fractions = fractions_of(num_quantiles)
-        context = self.config.context_range
-        middle = None if context is None else (context[0] + context[1]) / 2.0
-        self.default_beta = middle if self.config.context == "beta" else None
-        self._default_weight = middle if self.config.context == "collision_weight" else None
-        self._mask = self.config.sensor_mask
-        self._remembered = _memory_of(self.config.memory_s, self._mask, self.robot)
-        parts = ["actor", *(f"critics.{number}" for number in range(self.config.num_critics))]
-        self._encoders = Encoders(
-            [weights.part(f"{part}.encoder") for part in parts],
-            self._mask,
-            self.config.padding,
-            self.config.range_code,
-            self.config.restart_steps,
-            self.config.foreseen,
-        )
-        self._actor = Actor(weights)
-        self._critics = Critics(weights, self.fractions)
-        self.acting = weights.config.acting if acting is None else acting
+        self.default_beta = middle_of_range(self.config) if self.config.context == "beta" else None
+        self._observer = RobotObserver(self.config)
+        self._networks = RecurrentNetworks(weights, self.fractions, self.config.acting if acting is None else acting)
+        self._periods = ControlPeriods(self.config.period_s)
         self._halted = False
-        self._states: Array
-        self._read: Array
-        self._steps: int
-        self._commanded: tuple[float, float]
         self.reset()
 
     def reset(self) -> None:
         """Forget everything before: call it where the robot is put somewhere else, or gets a new task."""
         self._forget()
-        self._refused = 0
-        self._last: Stamps | None = None
-        self._last_fresh: Stamps | None = None
-        self._wanted: tuple[float, float] | None = None
+        self._periods.reset()
         self._told: Outlook | None = None
         self._advice: Advice | None = None
         self._noise = stream(0, "drawn actions of a policy")
@@ -164,27 +122,13 @@ class Policy:
 
     def __repr__(self) -> str:
         """Say what the agent is, and what its card says of how it drives."""
-        config = self.config
-        parts = [config.name, f"sensor {config.sensor}"]
-        if config.memory_s > 0.0:
-            parts.append(f"remembers {config.memory_s:g} s")
-        if config.context is not None and config.context_range is not None:
-            parts.append(f"{config.context} in [{config.context_range[0]:g}, {config.context_range[1]:g}]")
-        elif config.fixed_beta is not None:
-            parts.append(f"for beta={config.fixed_beta:g} alone")
-        parts.append(f"robot {self.robot.name}")
-        if self.acting.chooses:
-            parts.append(f"chooses among {self.acting.num_candidates} actions")
-        if self.measured is not None:
-            conditions = self.measured.conditions
-            collisions, rewards = ([c.metrics[name].mean for c in conditions] for name in ("collisions", "reward"))
-            parts.append(f"an episode: collisions {_span(collisions, 2)}, reward {_span(rewards, 0)}")
-        return f"Policy({', '.join(parts)})"
+        return f"Policy({summary(self.config, self.acting, self.measured)})"
 
     def __copy__(self) -> "Policy":
         """Copy the situation, and share what never changes."""
         copied = object.__new__(type(self))
-        own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_remembered", "navigator", "_noise")}
+        own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_observer", "navigator", "_noise")}
+        own |= {name: copy.copy(self.__dict__[name]) for name in ("_networks", "_periods")}
         own["_others"] = [copy.copy(other) for other in self._others]
         copied.__dict__ |= self.__dict__ | own
         return copied
@@ -196,15 +140,11 @@ class Policy:
         Raises:
             UserInputError: if the critics are to choose by a risk measure that is known to torch alone.
         """
-        return self._acting
+        return self._networks.acting
 
     @acting.setter
     def acting(self, acting: ActingSettings) -> None:
-        self._choice = ActionChoice(acting, self.config, self._actor, self._critics) if acting.chooses else None
-        self._acting = acting
-        # Offsets were fitted while it acted as its config says: acting otherwise it earns something else.
-        fitted = self.config.recalibration if acting == self.config.acting else None
-        self._recalibration = None if fitted is None else fitted.at(self.fractions)
+        self._networks.acting = acting
 
     @property
     def recalibrated(self) -> bool:
@@ -212,7 +152,7 @@ class Policy:
 
         So only while it acts as ``config.acting``, and what it does follows from what they say.
         """
-        return self._recalibration is not None
+        return self._networks.recalibrated
 
     @property
     def world(self) -> dict[str, Any]:
@@ -291,19 +231,18 @@ class Policy:
             >>> policy.foresee(0.0).wanted == bold, policy.foresee(-2.0).wanted == bold
             (True, False)
         """
-        if self._steps == 0:
-            raise UserInputError("nothing was seen since the memory was cleared: call act() first")
+        self._check_seen()
         if self.config.context == "collision_weight":
             raise UserInputError(
                 f"the memory of {self.config.name} depends on its collision weight: call act() instead"
             )
         context = self.check_beta(beta)
         if action is None:
-            return self._outlook(context)
+            return self._networks.outlook(context)
         asked = numbers_of(action, "action").astype(np.float32)
         if asked.shape != (2,) or not np.all(np.abs(asked) <= 1.0):
             raise UserInputError(f"action={action} is not two numbers from -1 to 1: give u_0 and u_1")
-        return self._outlook(context, asked)
+        return self._networks.outlook(context, asked)
 
     def outlooks(self, actions: NDArray[np.float32], beta: float | None = None) -> NDArray[np.float32]:
         """Return what the critics expect of many actions where the agent stands now, as :meth:`foresee` of each.
@@ -321,11 +260,14 @@ class Policy:
         Raises:
             UserInputError: if nothing was seen since :meth:`reset`, or `beta` is refused by :meth:`act`, too.
         """
-        if self._steps == 0:
-            raise UserInputError("nothing was seen since the memory was cleared: call act() first")
+        self._check_seen()
         context = self.check_beta(beta)
-        lower = self._critics.of_actions(self._read[1:], np.asarray(actions, np.float32), self._embedded(context))
-        return self._tell(lower, context)
+        return self._networks.outlooks(np.asarray(actions, np.float32), context)
+
+    def _check_seen(self) -> None:
+        """Refuse to say what is expected where nothing was seen."""
+        if self._networks.empty:
+            raise UserInputError("nothing was seen since the memory was cleared: call act() first")
 
     def check_beta(self, beta: float | None) -> float | None:
         """Return what the agent is told for a `beta`, None where that is nothing.
@@ -372,8 +314,8 @@ class Policy:
                 raise BadInputError("stop() was called")
             if stamps is not None:
                 stamps = as_given_now(stamps)
-                check_stamps(stamps, self._last, self.limits)
-            sectors = sectors_of(ranges, self._mask, self.limits, self.robot)
+                check_stamps(stamps, self._periods.last, self.limits)
+            sectors = sectors_of(ranges, self._observer.mask, self.limits, self.robot)
             next_two = waypoints_of(waypoints)
             measured = velocity_of(velocity, self.robot)
             context = self._context(beta, collision_weight)
@@ -391,111 +333,35 @@ class Policy:
         context: float | None,
         stamps: Stamps | None,
     ) -> Command:
-        fresh = self._is_due(stamps)
-        forgot = self._steps == 0
-        elapsed_s = self._elapsed_s(stamps)
-        self._refused = 0
-        self._last = stamps
+        if self._periods.memory_is_old(stamps):
+            self._forget()
+        forgot = self._networks.empty
+        elapsed_s = 0.0 if forgot else self._periods.elapsed_s(stamps)
+        fresh = self._periods.is_due(stamps)
+        self._periods.accept(stamps, fresh)
         if fresh:
-            self._last_fresh = stamps
             if self.navigator is not None:
                 self._advice = self.navigator.advise(
                     sectors.distances_m, sectors.covered, next_two, measured, elapsed_s
                 )
-                next_two, context = self._advice.waypoints, self._bolder(context, self._advice.boldness)
-            self._ask(sectors, next_two, measured, context, elapsed_s)
+                next_two, context = self._advice.waypoints, bolder(self.config, context, self._advice.boldness)
+            self._see(*self._observer.observe(sectors, next_two, measured, elapsed_s), context)
         return self._command(sectors, measured, fresh, fresh and forgot)
 
-    def _bolder(self, context: float | None, boldness: float) -> float | None:
-        """Return a beta that is turned towards the boldest of training; a collision weight stays."""
-        if context is None or self.config.context != "beta" or self.config.context_range is None:
-            return context
-        return context + boldness * (self.config.context_range[1] - context)
-
-    def _is_due(self, stamps: Stamps | None) -> bool:
-        """Return whether the agent is asked; else the robot goes on as it was told last, guarded anew."""
-        last = self._last_fresh
-        if stamps is None or last is None:
-            return True
-        shortest, longest = self.config.period_s
-        since = stamps.now_s - last.now_s
-        if since > _FORGET_AFTER * longest:
-            self._forget()
-            return True
-        # The recurrent network counts time in steps: a second look at one scan, or one in half the time, is none.
-        return stamps.scan_s > last.scan_s and since > shortest / 2.0
-
-    def _elapsed_s(self, stamps: Stamps | None) -> float:
-        """Return the time since the last observation; without stamps a call is the middle of training's periods."""
-        if self._steps == 0:
-            return 0.0
-        if stamps is None or self._last_fresh is None:
-            return (1 + self._refused) * sum(self.config.period_s) / 2.0
-        return stamps.scan_s - self._last_fresh.scan_s
-
-    def _ask(
-        self,
-        sectors: Sectors,
-        waypoints: tuple[tuple[float, float], tuple[float, float]],
-        measured: tuple[float, float],
-        context: float | None,
-        elapsed_s: float,
-    ) -> None:
-        bins = range_observation(sectors.distances_m, self._mask, self.robot.lidar.max_range_m)
-        vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self._commanded]
-        if self._remembered is not None:
-            vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
-        self._see(bins, vectors, context)
-
-    def _see(self, bins: Array, vectors: Sequence[float] | Array, context: float | None) -> Outlook:
+    def _see(
+        self, bins: NDArray[np.float32], vectors: Sequence[float] | NDArray[np.float32], context: float | None
+    ) -> Outlook:
         """Let the networks take a step, and return what they want and expect."""
-        weight = (context,) if self.config.context == "collision_weight" and context is not None else ()
-        told = np.array((*vectors, *weight), dtype=np.float32)
-        self._states = self._encoders.step(bins, told, self._states)
-        self._read = self._encoders.heads_read(self._states, told)
-        self._steps += 1
-        drawn = None
+        noise = None
         if self._advice is not None and self._advice.draws:
             noise = self._noise.standard_normal(2, np.float32)
-            drawn = self._actor.action(self._read[0], self._embedded(context), noise)
-        outlook = self._outlook(context, drawn)
-        self._wanted = outlook.wanted
-        self._told = outlook
-        return outlook
-
-    def _embedded(self, context: float | None) -> float | None:
-        """Return what the heads are told; None where they are told nothing."""
-        if self.config.embedding is None or context is None:
-            return None
-        return self.config.embedding[0] * context + self.config.embedding[1]
-
-    def _chosen(self, context: float | None, embedded: float | None) -> Array:
-        """Return what the agent does where it stands, [2]."""
-        if self._choice is None:
-            return self._actor.action(self._read[0], embedded)
-        return self._choice.best(self._read, context if self.config.context == "beta" else None, embedded)
-
-    def _outlook(self, context: float | None, action: Array | None = None) -> Outlook:
-        embedded = self._embedded(context)
-        if action is None:
-            action = self._chosen(context, embedded)
-        lower = self._critics.values(self._read[1:], action, embedded)
-        told = self._tell(lower, context)
-        raw, quantiles = (lower, told) if self.config.critic == "quantile" else (None, None)
-        values = told.tolist()  # of so few, Python's sum is the fastest mean
-        velocities = desired_velocities(action.tolist(), self.robot)
-        return Outlook(action, velocities, quantiles, sum(values) / len(values), raw)
-
-    def _tell(self, lower: Array, context: float | None) -> Array:
-        """Return what is told where the critics say this, [.., N]."""
-        if self._recalibration is None:
-            return lower
-        return self._recalibration.tell(lower, context if self.config.context == "beta" else None)
+        self._told = self._networks.see(bins, vectors, context, noise)
+        return self._told
 
     def _command(self, sectors: Sectors, measured: tuple[float, float], fresh: bool, forgot: bool) -> Command:
-        assert self._wanted is not None
-        assert self._told is not None
-        (v, omega), reason, been = self._wanted, None, None
+        outlook = self._told
+        assert outlook is not None
+        (v, omega), reason, been = outlook.wanted, None, None
         told = None
         if self._advice is not None:
             if fresh:
@@ -507,47 +373,24 @@ class Policy:
         if self.guard is not None:
             v, omega, reason = self.guard.limit(v, omega, sectors, measured, been)
         # Networks are told what the robot was told: the limits are part of the world.
-        self._commanded = (v, omega)
-        quantiles, value, raw = self._told.quantiles, self._told.value, self._told.raw_quantiles
+        self._observer.commanded = (v, omega)
         if reason is not None:
             told = f"limited by {reason}; it ends when the cause does"
-        return Command(v, omega, False, told, self._wanted, quantiles, value, fresh, forgot, raw)
+        quantiles, value, raw = outlook.quantiles, outlook.value, outlook.raw_quantiles
+        return Command(v, omega, False, told, outlook.wanted, quantiles, value, fresh, forgot, raw)
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""
-        self._refused += 1
-        self._commanded = (0.0, 0.0)
-        if self._refused >= _FORGET_AFTER:
+        self._observer.commanded = (0.0, 0.0)
+        if self._periods.refuse():
             self._forget()
-            self._last = self._last_fresh = None  # a clock that was set back is a clock
-        how = "resume() ends it" if self._halted else _RECOVERS
+        how = "resume() ends it" if self._halted else "it stands until good input comes"
         return Command(0.0, 0.0, True, f"{reason}; {how}")
 
     def _context(self, beta: float | None, collision_weight: float | None) -> float | None:
-        config = self.config
-        given = {"beta": beta, "collision_weight": collision_weight}
-        for name, value in given.items():
-            if value is not None and not is_finite_number(value):
-                raise BadInputError(f"{name} is no finite number ({type(value).__name__}): give one, as a float")
-            if value is None or name == config.context or (name == "beta" and value == config.fixed_beta):
-                continue
-            raise BadInputError(f"{name}={value:g} means nothing to this agent ({config.name}): leave it out")
-        if config.context is None or config.context_range is None:
-            return None
-        value = given[config.context]
-        if value is None:
-            value = self.default_beta if config.context == "beta" else self._default_weight
-        assert value is not None
-        low, high = config.context_range
-        if not low <= value <= high:
-            raise BadInputError(
-                f"{config.context}={value:g} is outside [{low:g}, {high:g}], where this agent was trained"
-            )
-        return float(value)
+        """Return what the networks are told; raise where that is refused."""
+        return context_of(self.config, self.default_beta if beta is None else beta, collision_weight)
 
     def _forget(self) -> None:
-        self._states = np.zeros((self._encoders.number, self._encoders.state_size), dtype=np.float32)
-        if self._remembered is not None:
-            self._remembered.reset()
-        self._commanded = (0.0, 0.0)
-        self._steps = 0
+        self._networks.forget()
+        self._observer.forget()

@@ -1,0 +1,68 @@
+"""What an agent's networks read of a robot: what it senses now, what it saw before, and what it was told last."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.deploy.policy.agent_config import AgentConfig
+from rcdsac_trl.robot.observation import range_observation, waypoint_observation
+from rcdsac_trl.robot.sectors import Sectors
+
+if TYPE_CHECKING:
+    from rcdsac_trl.robot.remembered_ranges import RememberedRanges
+
+_AT_ORIGIN = (0.0, 0.0, 0.0)
+
+
+def _memory_of(config: AgentConfig) -> "RememberedRanges | None":
+    """Make what remembers for an agent, if anything does; alone of all that drives a robot, that needs numba."""
+    if config.memory_s == 0.0:
+        return None
+    from rcdsac_trl.robot.remembered_ranges import RememberedRanges
+
+    return RememberedRanges(config.sensor_mask, config.memory_s, config.robot)
+
+
+class RobotObserver:
+    """Makes an agent's observations of what a robot measures; environments make their own.
+
+    Args:
+        config: of the agent.
+
+    Attributes:
+        mask: which range bins the agent is told, bool [180].
+        commanded: what the robot was told last, m/s and rad/s.
+    """
+
+    def __init__(self, config: AgentConfig) -> None:
+        self.mask, self._robot = config.sensor_mask, config.robot
+        self._remembered = _memory_of(config)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was seen before; the robot stands."""
+        if self._remembered is not None:
+            self._remembered.reset()
+        self.commanded = (0.0, 0.0)
+
+    def observe(
+        self,
+        sectors: Sectors,
+        waypoints: tuple[tuple[float, float], tuple[float, float]],
+        measured: tuple[float, float],
+        elapsed_s: float,
+    ) -> tuple[NDArray[np.float32], list[float]]:
+        """Return the range observation, float32 [180], and all vector observations, one behind the other.
+
+        Args:
+            sectors: what the range sensor says.
+            waypoints: the next two, x and y in m, robot's frame.
+            measured: velocities, m/s and rad/s.
+            elapsed_s: since the last observation, 0 at the first, s.
+        """
+        bins = range_observation(sectors.distances_m, self.mask, self._robot.lidar.max_range_m)
+        vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self.commanded]
+        if self._remembered is not None:
+            vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
+        return bins, vectors
