@@ -12,6 +12,7 @@ from torchrl.envs import Compose, InitTracker, StepCounter, TransformedEnv
 
 import rcdsac_trl
 from rcdsac_trl.deploy import Policy
+from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
@@ -74,6 +75,24 @@ def test_many_agents_have_memories_of_their_own() -> None:
     # Another number of agents are others.
     fresh = Policy(weights).act_on(rows[0], beta=-1.0)
     np.testing.assert_array_equal(together.act_on(rows[0], beta=-1.0), fresh)
+
+
+def test_how_they_act_is_changed_for_all_of_them() -> None:
+    rng = np.random.default_rng(6)
+    policy, number = Policy(agent(), acting=ActingSettings(num_candidates=16, spread=3.0)), 4
+    views = [seen(rng, policy.config.sensor_mask)] * number
+    observation = {name: np.stack([view[name] for view in views]) for name in views[0]}
+    chosen = policy.act_on(observation)
+    policy.reset()
+    policy.acting = BY_MEAN
+    by_mean = policy.act_on(observation)
+    assert not np.allclose(chosen, by_mean), "else the test could not tell"
+    policy.reset()
+    policy.acting = ActingSettings(num_candidates=16, spread=3.0)
+    policy.act_on(observation)
+    policy.acting = BY_MEAN
+    after = policy.act_on(observation)
+    assert np.array_equal(after, np.broadcast_to(after[0], after.shape))
 
 
 def test_a_reset_forgets_all_of_them() -> None:

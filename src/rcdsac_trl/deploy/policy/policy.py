@@ -145,6 +145,8 @@ class Policy:
     @acting.setter
     def acting(self, acting: ActingSettings) -> None:
         self._networks.acting = acting
+        for other in self._others:
+            other.acting = acting
 
     @property
     def recalibrated(self) -> bool:
