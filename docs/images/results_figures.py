@@ -25,11 +25,13 @@ def place(run: Path) -> int:
 def main() -> None:
     """Read, draw."""
     # An agent or a baseline a folder; those of the study lie deeper, or are called otherwise.
-    episodes = read_episodes(sorted(sorted(RESULTS.glob("*-narrow")), key=place))
+    narrow = sorted(RESULTS.glob("*-narrow"), key=lambda run: (place(run), run))
+    episodes = read_episodes(narrow)
+    of_both_sensors = read_episodes([*narrow, *sorted(RESULTS.glob("*-sparse"))])
     reference = episodes.conditions["agent"].tolist().index(REFERENCE)
     figures: dict[str, Figure | None] = {
-        "beta_response": beta_response(episodes, "pow"),
-        "beta_response_cvar": beta_response(episodes, "cvar"),
+        "beta_response": beta_response(of_both_sensors, "pow"),
+        "beta_response_cvar": beta_response(of_both_sensors, "cvar"),
         "differences_collisions": paired_differences(episodes, reference, "collisions"),
     }
     for name, figure in figures.items():

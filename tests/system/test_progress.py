@@ -45,6 +45,20 @@ def test_the_rest_is_guessed_by_the_pace_since_the_first_part(
         assert capsys.readouterr().err == "rcdsac_trl: 1 of 12 runs, about 4 min left (at work for 70 s)\n"
 
 
+def test_nothing_is_guessed_from_a_first_step(
+    clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Work("50 maps", 50, "map") as work:
+        work.reach(0.001)
+        clock(30.0)  # something is compiled
+        work.reach(0.002)
+        assert (work.left_s(), str(work)) == (None, "0 of 50 maps")
+        clock(2.0)
+        work.reach(0.321)  # 0.32 maps in 32 s
+        assert work.left_s() == pytest.approx(100.0 * (50 - 0.321))
+    assert capsys.readouterr().err == "rcdsac_trl: 50 maps\nrcdsac_trl: 0 of 50 maps, about 83 min left\n"
+
+
 def test_one_unit_is_told_by_its_share(clock: Callable[[float], None]) -> None:
     with Work("a film", 1, "film") as work:
         told = [str(work) for _ in work.within((clock(1.0) for _ in range(4)), 4)]

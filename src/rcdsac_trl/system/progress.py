@@ -16,6 +16,8 @@ SILENCE_S = 10.0
 """Nothing is silent for longer."""
 # After so long a first guess is worth something.
 _FORETOLD_S = 3.0
+# And after this share of the work: the first steps may wait for a compiler.
+_FORETOLD_SHARE = 0.002
 
 Watch = Callable[[int], None]
 """Is told, again and again, how many steps are done so far."""
@@ -65,7 +67,9 @@ class Work:
         self._reached = max(self._reached, min(units, self._total))
         if self._began is None and self._reached > 0.0:
             self._began = time.monotonic(), self._reached
-        if not self._foretold and self._began is not None and time.monotonic() - self._began[0] >= _FORETOLD_S:
+        if self._foretold or self._began is None or time.monotonic() - self._began[0] < _FORETOLD_S:
+            return
+        if self.left_s() is not None:
             self._foretold = True
             self.tell()
 
@@ -83,7 +87,7 @@ class Work:
 
     def left_s(self) -> float | None:
         """Guess how long the rest will take, s; None where nobody knows yet."""
-        if self._began is None or self._reached <= self._began[1]:
+        if self._began is None or self._reached - self._began[1] < _FORETOLD_SHARE * self._total:
             return None
         pace_s = (time.monotonic() - self._began[0]) / (self._reached - self._began[1])
         return pace_s * (self._total - self._reached)
