@@ -1,7 +1,7 @@
 """Drive agents and planners while noise, delay, clutter or people disturb them, for the table of docs/off-the-maps.md.
 
 Each disturbance is one evaluation on the same maps, goals and movers; `--name`'s go into ``results/disturbances``.
-What is done already in ``build/disturbances`` is not driven again::
+What a name has done already at that size, in ``build/disturbances``, is not driven again::
 
     python docs/disturbances.py --name rcdsac_cvar-narrow run=rcdsac_cvar-narrow beta=[0.25]
     python docs/disturbances.py --name mppi baseline=mppi
@@ -43,9 +43,10 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=5, help="on each of them (default: %(default)s)")
     parser.add_argument("overrides", nargs="+", help="whom evaluate drives: run=<agent> beta=[<one>], baseline=<name>")
     options = parser.parse_args()
+    done = ROOT / "build" / "disturbances" / f"{options.name}-{options.maps}x{options.episodes}"
     tables = []
     for number, (disturbance, changes) in enumerate(DISTURBANCES.items()):
-        folder = ROOT / "build" / "disturbances" / options.name / str(number)
+        folder = done / str(number)
         if not (folder / "episodes.csv").is_file():
             sizes = f"num_maps={options.maps}", f"num_episodes={options.episodes}", f"out={folder}"
             make_evaluation(compose("evaluate", [*options.overrides, *changes, *sizes])).run()

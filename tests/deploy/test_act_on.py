@@ -79,16 +79,16 @@ def test_many_agents_have_memories_of_their_own() -> None:
 
 def test_how_they_act_is_changed_for_all_of_them() -> None:
     rng = np.random.default_rng(6)
-    policy, number = Policy(agent(), acting=ActingSettings(num_candidates=16, spread=3.0)), 4
-    views = [seen(rng, policy.config.sensor_mask)] * number
-    observation = {name: np.stack([view[name] for view in views]) for name in views[0]}
+    choosing = ActingSettings(num_candidates=16, spread=3.0)
+    policy = Policy(agent(), acting=choosing)
+    observation = {name: np.stack([value] * 4) for name, value in seen(rng, policy.config.sensor_mask).items()}
     chosen = policy.act_on(observation)
     policy.reset()
     policy.acting = BY_MEAN
     by_mean = policy.act_on(observation)
     assert not np.allclose(chosen, by_mean), "else the test could not tell"
     policy.reset()
-    policy.acting = ActingSettings(num_candidates=16, spread=3.0)
+    policy.acting = choosing
     policy.act_on(observation)
     policy.acting = BY_MEAN
     after = policy.act_on(observation)

@@ -20,7 +20,9 @@ from rcdsac_trl.agent.risk import CVaR, PowerLaw, RiskMeasure
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy import Policy
 from rcdsac_trl.deploy.policy.acting import ActingSettings
+from rcdsac_trl.deploy.policy.distortion import fractions_of
 from rcdsac_trl.release.run_weights import weights_of_run
+from rcdsac_trl.robot.look_ahead import told_of_action
 from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy, LayerValues
 from rcdsac_trl.rollout.environments import rollout_worker
 from rcdsac_trl.rollout.make_agent import make_loss, make_policy
@@ -128,7 +130,7 @@ def test_what_an_agent_chooses_does_not_depend_on_the_others() -> None:
 
 
 # ----------------------------------------------------------------------------------------------- values of many actions
-FRACTIONS = (torch.arange(8) + 0.5) / 8.0
+FRACTIONS = torch.from_numpy(fractions_of(8))
 
 
 def critic_head(kind: str, measure: RiskMeasure | None, look_ahead: bool) -> TensorDictModule:
@@ -140,10 +142,9 @@ def critic_head(kind: str, measure: RiskMeasure | None, look_ahead: bool) -> Ten
 
 def asked(number: int, head: TensorDictModule, measure: RiskMeasure) -> tuple[Tensor, Tensor, Tensor]:
     """Return what heads read, actions and betas of some agents."""
-    told = 2 if head.module.look_ahead is None else 4
+    told = told_of_action(2, head.module.look_ahead is not None)
     memory = torch.rand(number, head.module.input.in_features - told)
-    betas = measure.low + (measure.high - measure.low) * torch.rand(number, 1)
-    return memory, 2.0 * torch.rand(number, 9, 2) - 1.0, betas
+    return memory, 2.0 * torch.rand(number, 9, 2) - 1.0, measure.from_uniform(torch.rand(number, 1))
 
 
 @pytest.mark.parametrize("look_ahead", [True, False])
@@ -168,9 +169,8 @@ def test_compiled_values_are_the_layers(
         found = compiled(memory, actions, betas, begins=True)
         torch.testing.assert_close(found, layers(memory, actions, betas, begins=True))
         assert found.std(1).min() > 1e-4  # else all actions are alike here
-        alone = [
-            compiled(*(each[row : row + 1] for each in (memory, actions, betas)), begins=False) for row in range(4)
-        ]
+        rows = zip(memory.split(1), actions.split(1), betas.split(1), strict=True)
+        alone = [compiled(*row, begins=False) for row in rows]
         assert torch.equal(found, torch.cat(alone))
 
         turned = betas.flip(0)

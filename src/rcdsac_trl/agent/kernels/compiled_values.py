@@ -15,7 +15,7 @@ from rcdsac_trl.agent.heads import QuantileHead, ScalarHead
 from rcdsac_trl.agent.kernels.compiled_encoder import Floats, WeightsOfNow, add_product, copied
 from rcdsac_trl.agent.kernels.matmul import empty_aligned, matmul
 from rcdsac_trl.agent.risk import RiskMeasure
-from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, HAT_OFFSETS, HAT_SLOPES
+from rcdsac_trl.robot.look_ahead import FORESEEN_SIZE, HAT_OFFSETS, HAT_SLOPES, told_of_action
 from rcdsac_trl.system.jit import njit
 
 # Sums are vectorised: in which order follows from the sizes alone.
@@ -149,7 +149,7 @@ class CompiledValues:
 def _head_weights(head: Any) -> HeadWeights:
     """Lay out the weights of a critic's head."""
     weight = head.input.weight.t()
-    told = 2 if head.look_ahead is None else 4
+    told = told_of_action(2, head.look_ahead is not None)
     tensors = {
         "memory": weight[:-told],
         "told": weight[-told:],
