@@ -19,6 +19,7 @@ from rcdsac_trl.agent.risk import (
     RiskMeasure,
     VaR,
     Wang,
+    WidePowerLaw,
     make_measure,
 )
 from rcdsac_trl.errors import UserInputError
@@ -32,6 +33,7 @@ BETAS: dict[str, tuple[float, ...]] = {
     "neutral": (0.0,),
     "cvar": (0.01, 0.1, 0.25, 0.5, 0.75, 1.0),
     "pow": (-2.0, -1.5, -1.0, -0.5, -0.1, 0.0),
+    "pow_wide": (-8.0, -4.0, -2.0, -1.0, -0.1, 0.0),
     "wang": (-2.0, -1.0, -0.3, 0.0, 0.5, 2.0),
     "cpw": (0.3, 0.5, 0.71, 0.9, 1.0),
     "var": (0.05, 0.25, 0.5, 0.95),
@@ -71,6 +73,8 @@ NORMAL = [
     (PowerLaw(), 0.0, 0.0),
     (PowerLaw(), -1.0, -1.0 / math.sqrt(math.pi)),
     (PowerLaw(), -2.0, -1.5 / math.sqrt(math.pi)),
+    (WidePowerLaw(), -2.0, -1.5 / math.sqrt(math.pi)),
+    (WidePowerLaw(), -8.0, -1.4850131),  # the mean of the smallest of nine, as tables of order statistics have it
     *((Wang(), b, b) for b in (-2.0, -0.5, 0.0, 1.0)),
     (CPW(), 1.0, 0.0),
     *((VaR(), b, inverse_cdf(b)) for b in (0.05, 0.5, 0.9)),
@@ -86,6 +90,7 @@ TWO_POINT = [
     (Neutral(), 0.0, lambda p: p),
     *((CVaR(), b, lambda p, b=b: min(p / b, 1.0)) for b in (0.1, 0.3, 1.0)),
     *((PowerLaw(), b, lambda p, b=b: 1.0 - (1.0 - p) ** (1.0 - b)) for b in (-2.0, -0.5, 0.0)),
+    (WidePowerLaw(), -7.0, lambda p: 1.0 - (1.0 - p) ** 8),
     *((Wang(), b, lambda p, b=b: cdf(inverse_cdf(p) - b)) for b in (-1.5, 0.7)),
     *((VaR(), b, lambda p, b=b: float(b <= p)) for b in (0.1, 0.5)),
 ]
@@ -134,7 +139,7 @@ def test_neutral_beta_distorts_nothing(name: str) -> None:
     torch.testing.assert_close(measure.psi(tau, as_tensor(measure.neutral_beta or 0.0)), tau)
 
 
-@pytest.mark.parametrize("name", ["cvar", "pow", "wang", "var"])
+@pytest.mark.parametrize("name", ["cvar", "pow", "pow_wide", "wang", "var"])
 def test_smaller_beta_is_more_averse(name: str) -> None:
     measure = MEASURES[name]()
     values = [value(measure, beta) for beta in BETAS[name]]
@@ -163,6 +168,7 @@ SAMPLES = [
     # The smallest of 1 - beta draws from the sample, with replacement.
     (PowerLaw(), -1.0, [5 / 9, 3 / 9, 1 / 9]),
     (PowerLaw(), -2.0, [7 / 8, 1 / 8]),
+    (WidePowerLaw(), -5.0, [63 / 64, 1 / 64]),
     (Wang(), -1.0, [cdf(1.0), 1.0 - cdf(1.0)]),  # of two: psi maps that fraction to one half
     (VaR(), 0.5, [0.0, 1.0, 0.0, 0.0]),
 ]
@@ -179,7 +185,10 @@ def test_weights_of_a_sample_are_exact(measure: RiskMeasure, beta: float, weight
 @pytest.mark.parametrize(("name", "beta"), [case for case in CASES if case[0] not in ("cvar", "var")])
 def test_the_inverse_of_psi_undoes_it(name: str, beta: float) -> None:
     measure, u = MEASURES[name](), torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
-    torch.testing.assert_close(measure.psi(measure.inverse_psi(u, as_tensor(beta)), as_tensor(beta)), u)
+    found = measure.inverse_psi(u, as_tensor(beta))
+    told = found < 1.0 - 1e-9  # closer to 1 float64 has no digits left to undo
+    torch.testing.assert_close(measure.psi(found, as_tensor(beta))[told], u[told])
+    assert told[:86].all()
 
 
 @pytest.mark.parametrize("name", ["cpw", "var"])
@@ -204,6 +213,7 @@ def test_embeddings_of_all_betas_are_distinct(name: str) -> None:
 
 def test_embeddings_by_hand() -> None:
     assert [PowerLaw().embed(b) for b in (0.0, -0.5, -2.0)] == [0.0, 0.25, 1.0]
+    assert [WidePowerLaw().embed(b) for b in (0.0, -0.5, -8.0)] == [0.0, 0.0625, 1.0]
     assert CVaR().embed(0.25) == 0.25
     assert Wang().embed(-1.0) == 0.25
 
@@ -216,11 +226,24 @@ def test_samples_fill_the_range_and_repeat(name: str) -> None:
     assert draws[0].shape == (50, 100)
     assert draws[0].min() >= measure.low - 1e-6
     assert draws[0].max() <= measure.high
-    middle, width = 0.5 * (measure.low + measure.high), measure.high - measure.low
-    assert draws[0].mean().item() == pytest.approx(middle, abs=0.02 * width + 1e-9)
+    # 1 / (2 - beta) is uniform over [0.1, 0.5] for the wide power law, beta itself for all others.
+    mean = 2.0 - math.log(5.0) / 0.4 if name == "pow_wide" else 0.5 * (measure.low + measure.high)
+    assert draws[0].mean().item() == pytest.approx(mean, abs=0.02 * (measure.high - measure.low) + 1e-9)
     assert measure.from_uniform(0.0) == measure.low
     for extreme in (draws[0].min(), draws[0].max()):
         assert torch.isfinite(measure.psi(torch.tensor([0.0, 0.3, 1.0 - 2.0**-24]), extreme)).all()
+
+
+def test_draws_of_the_wide_power_law_look_at_all_shares_of_returns_alike() -> None:
+    """The mean fraction that it looks at, 1 / (2 - beta), is uniform: over [0.1, 0.5], as that of CVaR from 0.2 on."""
+    drawn = WidePowerLaw().sample((20_000,), torch.Generator().manual_seed(3))
+    looked_at = (1.0 / (2.0 - drawn.double())).sort().values
+    uniform = torch.linspace(0.1, 0.5, len(drawn), dtype=torch.float64)
+    assert (looked_at - uniform).abs().max() < 0.4 * 0.015  # Kolmogorov-Smirnov: 1.95 / sqrt(20,000) at 0.1 %
+    measure = WidePowerLaw(low=-3.0, high=-0.5)
+    assert measure.from_uniform(0.5) == pytest.approx(2.0 - 1.0 / 0.3)  # 1/5 and 2/5 at the ends
+    beta, tau = as_tensor(-3.0), TAU
+    assert measure.psi(tau, beta).mean().item() == pytest.approx(0.2, abs=1e-6)
 
 
 def test_sampled_range_is_a_setting() -> None:
@@ -267,7 +290,7 @@ def test_wrong_ranges_and_names() -> None:
         PowerLaw(low=-0.5, high=-1.0)
     with pytest.raises(UserInputError, match="outside the domain"):
         make_measure("cvar", low=0.0)
-    with pytest.raises(UserInputError, match=r"no risk measure 'power'.*neutral, cvar, pow, wang, cpw, var"):
+    with pytest.raises(UserInputError, match=r"no risk measure 'power'.*neutral, cvar, pow, pow_wide, wang, cpw, var"):
         make_measure("power")
 
 

@@ -225,7 +225,7 @@ class PowerLaw(RiskMeasure):
 
     0 is neutral and smaller is more averse (paper, "Risk-Sensitive Objective"). Dual density
     :math:`g'(u) = (1-\beta)(1-u)^{-\beta}`. The formula goes on below -2, but the embedding
-    :math:`-\beta/2` must stay in [0, 1], so -2 ends the domain.
+    :math:`-\beta/2` must stay in [0, 1], so -2 ends the domain; :class:`WidePowerLaw` reaches farther.
     """
 
     low: float = -2.0
@@ -246,6 +246,31 @@ class PowerLaw(RiskMeasure):
     def embed(self, beta: Scalar) -> Scalar:
         """Return ``-beta / 2``: 0 is neutral, 1 the most averse."""
         return -0.5 * beta
+
+
+@dataclass(frozen=True)
+class WidePowerLaw(PowerLaw):
+    r"""The power law for ``beta`` in [-8, 0]: as averse as CVaR from 0.2 on, by the mean of :math:`\psi`.
+
+    That mean over :math:`\tau` is :math:`1/(2-\beta)`, and :math:`\beta/2` for CVaR. Training draws ``beta`` so that
+    the mean is uniform, as CVaR's is: uniform in ``beta`` itself, three draws in four would be more averse than the
+    paper's -2. Not in the paper.
+    """
+
+    low: float = -8.0
+    high: float = 0.0
+
+    name: ClassVar[str] = "pow_wide"
+    domain: ClassVar[Interval] = Interval(-8.0, 0.0)
+
+    def embed(self, beta: Scalar) -> Scalar:
+        """Return ``-beta / 8``: 0 is neutral, 1 the most averse."""
+        return -0.125 * beta
+
+    def from_uniform(self, u: Scalar) -> Scalar:
+        r"""Map uniform numbers in [0, 1) to ``beta``: the mean of :math:`\psi` becomes uniform."""
+        lowest, highest = (1.0 / (2.0 - beta) for beta in (self.low, self.high))
+        return 2.0 - 1.0 / (lowest + (highest - lowest) * u)
 
 
 @dataclass(frozen=True)
@@ -322,7 +347,7 @@ class VaR(RiskMeasure):
 
 #: Every measure by its name.
 MEASURES: dict[str, type[RiskMeasure]] = {
-    measure.name: measure for measure in (Neutral, CVaR, PowerLaw, Wang, CPW, VaR)
+    measure.name: measure for measure in (Neutral, CVaR, PowerLaw, WidePowerLaw, Wang, CPW, VaR)
 }
 
 

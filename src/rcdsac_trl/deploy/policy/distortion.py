@@ -36,10 +36,15 @@ def _cpw(tau: Doubles, beta: float) -> Doubles:
     return weighted / (weighted + (1.0 - tau) ** beta) ** (1.0 / beta)
 
 
+def _power(tau: Doubles, beta: float) -> Doubles:
+    return -np.expm1(np.log1p(-tau) / (1.0 - beta))
+
+
 PSI: Mapping[str, Callable[[Doubles, float], Doubles]] = {
     "neutral": lambda tau, beta: tau,
     "cvar": lambda tau, beta: beta * tau,
-    "pow": lambda tau, beta: -np.expm1(np.log1p(-tau) / (1.0 - beta)),
+    "pow": _power,
+    "pow_wide": _power,
     "wang": _wang,
     "cpw": _cpw,
     "var": lambda tau, beta: np.full_like(tau, beta),
