@@ -11,6 +11,11 @@ from pathlib import Path
 # Small tensors: a second thread costs more than it brings, and far more while tests run side by side. What tests start
 # inherits it, NumPy reads it as it is imported.
 os.environ["OMP_NUM_THREADS"] = "1"
+# What is imported is compiled once, whatever the environment asks for: torch and what comes with it takes a process
+# 20 s where it compiles all of that for itself, else 5 s, and tests start dozens of processes.
+if sys.dont_write_bytecode:
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 
 import pytest
 import torch
