@@ -20,9 +20,11 @@ if sys.dont_write_bytecode:
 import pytest
 import torch
 
+from composed_once import remember_compositions
 from rcdsac_trl.system.cores import usable_cores
 
 torch.set_num_threads(1)
+remember_compositions()
 
 # Side by side, whole files are given out in this order: those that take longest first, so that no worker is left with
 # one of them when there is nothing else to do. But in a fresh checkout the first has numba compile most of what there

@@ -253,6 +253,8 @@ MISTAKES = [
 ]
 TELL = """
 import importlib, json, sys
+from composed_once import remember_compositions
+remember_compositions()
 told = []
 for verb, words in json.loads(sys.argv[1]):
     sys.argv[1:] = words
@@ -276,7 +278,7 @@ def test_mistakes_are_told_without_torch(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", TELL, json.dumps(calls)],
         cwd=tmp_path,
-        env=os.environ | {"MALLOC_MMAP_MAX_": "0"},
+        env=os.environ | {"MALLOC_MMAP_MAX_": "0", "PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
     )
