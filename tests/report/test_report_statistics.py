@@ -26,6 +26,13 @@ def test_cvar_by_hand() -> None:
 def test_the_interquartile_mean_leaves_out_a_quarter_at_either_end() -> None:
     assert statistics.interquartile_mean(np.array([-1000.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 1000.0])) == 2.5
     assert statistics.interquartile_mean(np.array([np.nan, 0.0, 1.0, 3.0, 9.0])) == 2.0
+    assert np.isnan(statistics.interquartile_mean(np.array([np.nan])))
+
+
+def test_the_interquartile_mean_is_scipys_trimmed_one() -> None:
+    for size in range(1, 30):
+        values = np.random.default_rng(size).normal(size=size)
+        assert statistics.interquartile_mean(values) == stats.trim_mean(values, 0.25)
 
 
 def test_missing_values_do_not_count() -> None:

@@ -113,7 +113,12 @@ def interquartile_mean(values: Array) -> float:
         >>> interquartile_mean(np.array([0.0, 1.0, 3.0, 1000.0]))
         2.0
     """
-    return float(stats.trim_mean(values[np.isfinite(values)], 0.25))
+    measured = values[np.isfinite(values)]
+    if not measured.size:
+        return float("nan")
+    cut = measured.size // 4
+    # SciPy's `trim_mean`, to the bit, without the checks that take it twenty times as long: thousands of resamples ask.
+    return float(np.partition(measured, (cut, measured.size - cut - 1))[cut : measured.size - cut].mean())
 
 
 def lower_mean(values: Array, share: float) -> Array:
