@@ -17,6 +17,7 @@ their order. The table of an accelerator is what ``benchmarks/accelerator.py`` w
 import json
 import re
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,7 @@ def _markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "".join([lines[0], f"|{'---|' * len(headings)}\n", *lines[1:]])
 
 
+@cache
 def measured_of(name: str) -> Mapping[str, Any]:
     """Return what was measured of an agent that ships, or of a baseline.
 
