@@ -121,15 +121,18 @@ NOT_FINITE = [float("nan"), float("inf")]
 def test_every_key_of_a_training_refuses_what_it_cannot_be() -> None:
     """Each leaf by itself: what is neither its type nor finite never gets through."""
     wrong_text_allowed = {"resume", "init", "device", "name"}
+    cfg = OmegaConf.create(TRAINING)  # changed in place: to make one takes five times as long as to refuse it
     for at in PLACES:
-        here = TRAINING
-        for key in at:
-            here = here[key]
-        if isinstance(here, dict | list):
+        section = _at(cfg, at[:-1])
+        kept = section[at[-1]]
+        if OmegaConf.is_config(kept):
             continue
         for value in [*NOT_FINITE, {"a": 1}, *([] if at[-1] in wrong_text_allowed else ["some text"])]:
+            section[at[-1]] = value
             with pytest.raises(UserInputError):
-                check_training(OmegaConf.create(changed(TRAINING, at, value)))
+                check_training(cfg)
+        section[at[-1]] = kept
+    assert cfg == TRAINING
 
 
 @pytest.mark.parametrize("few", [60, pytest.param(1500, marks=MANY)])
