@@ -410,6 +410,27 @@ def test_without_cyclonedds_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
         dds_node.bridge_of(dds_node._parser().parse_args(["anybody"]))
 
 
+def test_it_leads_around_what_blocks_the_way_where_the_command_line_says_so(folder: Path) -> None:
+    """What stands across the way ends 25 degrees left of it and 60 degrees right."""
+    first = {}
+    for arguments in ([], ["--detours"]):
+        bridge, robot = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), *arguments])), Robot()
+        policy = bridge.driver.policy
+        for step in range(30):
+            now_s = 10.0 + PERIOD_S * step
+            scanned, standing = laser(now_s), odometry(now_s)
+            scanned.ranges = [1.2 if -60 <= i - 180 < 25 else 4.0 for i in range(360)]
+            standing.twist.twist.linear.x = standing.twist.twist.angular.z = 0.0
+            robot.say(scan=scanned, odom=standing, plan=plan(now_s, ((0.0, 0.0), (5.0, 0.0))))
+            bridge.step(now_s)
+            first[bool(arguments), step] = None if policy._advice is None else policy._advice.waypoints[0]
+    assert first[False, 29] is None
+    assert first[True, 20] == pytest.approx((5.0, 0.0), abs=0.01)  # 2.8 s
+    x, y = first[True, 29] or (0.0, 0.0)
+    assert 0.7 < math.hypot(x, y) < 2.0
+    assert y > 0.4
+
+
 def test_zeros_are_open_space_where_the_command_line_says_so(folder: Path) -> None:
     for arguments, reads_zero in (([], True), (["--zero-means", "far"], False)):
         bridge = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), *arguments]))

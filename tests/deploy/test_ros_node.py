@@ -14,6 +14,7 @@ from test_frames import tf
 from test_robot_driver import cloud, laser, odometry, path
 
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
+from rcdsac_trl.deploy.navigation.navigator import NavigatorSettings
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.errors import UserInputError
 from robots import agent
@@ -176,6 +177,15 @@ def test_it_reads_transforms_and_says_where_the_sensors_are_that_have_none(ros_n
     node.timers[0]()
     assert "the localisation is lost" in node.published[-1].data
     assert "the localisation is lost" in node.told[-1]
+
+
+def test_it_leads_around_what_blocks_the_way_where_that_is_asked_for(ros_node: Any) -> None:
+    assert ros_node.PolicyNode().driver.policy.navigator is None
+    Node.given["detours"] = True
+    node = ros_node.PolicyNode()
+    assert node.driver.policy.navigator.settings == NavigatorSettings(watchdog=None)
+    assert driven(node).twist.linear.x != 0.0
+    assert node.driver.policy._advice is not None
 
 
 def test_cameras_are_read_in_place_of_the_scanner(ros_node: Any) -> None:

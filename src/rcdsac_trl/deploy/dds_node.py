@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, get_args
 
 import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings, Localisation
+from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.topics import without_numbers
 from rcdsac_trl.deploy.sensors.scan import Meaning
@@ -62,15 +63,18 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
 
     domain_id = _domain_id(os.environ.get("ROS_DOMAIN_ID") or "0")
     remapped = dict(_renaming(text) for text in args.remap)
+    policy = rcdsac_trl.load(args.agent)
+    if args.detours:
+        policy.navigator = Navigator(NavigatorSettings(watchdog=None), policy.robot)
     driver = Driver(
-        rcdsac_trl.load(args.agent),
+        policy,
         mount=_mount(args),
         cameras={frame: _view_rad(frame, view) for frame, _, view in args.camera},
         zero_means=args.zero_means,
         nan_means=args.nan_means,
         frames=FrameSettings(args.localisation, args.localisation_timeout, args.base_frame),
     )
-    driver.policy.check_beta(args.beta)
+    policy.check_beta(args.beta)
     driver.beta = args.beta
     clouds = [topic for _, topic, _ in args.camera]
     return DdsBridge(driver, domain_id, remapped=remapped, clouds=clouds, simulated=args.use_sim_time)
@@ -183,6 +187,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="SECONDS",
         help="stand when the localisation's newest word is older (default: %(default)s; inf: never for that)",
     )
+    parser.add_argument("--detours", action="store_true", help="lead around what blocks the way for some seconds")
     parser.add_argument("--base-frame", help="the robot's frame; else the odometry's child_frame_id")
     parser.add_argument("--use-sim-time", action="store_true", help="the clock is that of the topic clock")
     parser.add_argument(

@@ -40,6 +40,7 @@ from tf2_msgs.msg import TFMessage
 
 import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
+from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
 from rcdsac_trl.deploy.ros.topics import DRIVING, readers_of, without_numbers, writers_of
@@ -69,8 +70,11 @@ class PolicyNode(Node):
             )
         cameras = self._cameras()
         defaults = FrameSettings()
+        policy = rcdsac_trl.load(agent)
+        if self._given("detours", False):
+            policy.navigator = Navigator(NavigatorSettings(watchdog=None), policy.robot)
         self.driver = Driver(
-            rcdsac_trl.load(agent),
+            policy,
             mount=self._mount(),
             cameras={frame: view_rad for frame, _, view_rad in cameras},
             zero_means=self._given("zero_means", "invalid"),

@@ -37,7 +37,8 @@ class NavigatorSettings:
 
     Attributes:
         replan: hand out the corners of a detour where the way to the next waypoint is blocked.
-        blocked_s: for how long it must have been, s: agents drive around small things by themselves.
+        blocked_s: for how long it must have been, s: agents drive around small things by themselves, and what walks
+            is often gone by then.
         memory_s: what was seen is forgotten after so long, s.
         watchdog: when it helps an agent that gets nowhere, and how; None: never.
 
@@ -46,7 +47,7 @@ class NavigatorSettings:
     """
 
     replan: bool = True
-    blocked_s: float = 1.0
+    blocked_s: float = 3.0
     memory_s: float = 30.0
     watchdog: WatchdogSettings | None = field(default_factory=WatchdogSettings)
 
