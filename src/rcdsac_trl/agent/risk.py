@@ -244,8 +244,8 @@ class PowerLaw(RiskMeasure):
         return (1.0 - beta) * (1.0 - u) ** (-beta)
 
     def embed(self, beta: Scalar) -> Scalar:
-        """Return ``-beta / 2``: 0 is neutral, 1 the most averse."""
-        return -0.5 * beta
+        """Return ``beta`` as a share of the most averse, ``-beta / 2``: 0 is neutral, 1 the most averse."""
+        return beta / self.domain.low
 
 
 @dataclass(frozen=True)
@@ -262,10 +262,6 @@ class WidePowerLaw(PowerLaw):
 
     name: ClassVar[str] = "pow_wide"
     domain: ClassVar[Interval] = Interval(-8.0, 0.0)
-
-    def embed(self, beta: Scalar) -> Scalar:
-        """Return ``-beta / 8``: 0 is neutral, 1 the most averse."""
-        return -0.125 * beta
 
     def from_uniform(self, u: Scalar) -> Scalar:
         r"""Map uniform numbers in [0, 1) to ``beta``: the mean of :math:`\psi` becomes uniform."""

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, get_args
 
 import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings, Localisation
-from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.topics import without_numbers
 from rcdsac_trl.deploy.sensors.scan import Meaning
@@ -63,18 +62,16 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
 
     domain_id = _domain_id(os.environ.get("ROS_DOMAIN_ID") or "0")
     remapped = dict(_renaming(text) for text in args.remap)
-    policy = rcdsac_trl.load(args.agent)
-    if args.detours:
-        policy.navigator = Navigator(NavigatorSettings(watchdog=None), policy.robot)
     driver = Driver(
-        policy,
+        rcdsac_trl.load(args.agent),
         mount=_mount(args),
         cameras={frame: _view_rad(frame, view) for frame, _, view in args.camera},
         zero_means=args.zero_means,
         nan_means=args.nan_means,
         frames=FrameSettings(args.localisation, args.localisation_timeout, args.base_frame),
+        detours=args.detours,
     )
-    policy.check_beta(args.beta)
+    driver.policy.check_beta(args.beta)
     driver.beta = args.beta
     clouds = [topic for _, topic, _ in args.camera]
     return DdsBridge(driver, domain_id, remapped=remapped, clouds=clouds, simulated=args.use_sim_time)

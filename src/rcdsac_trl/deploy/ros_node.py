@@ -40,7 +40,6 @@ from tf2_msgs.msg import TFMessage
 
 import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
-from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
 from rcdsac_trl.deploy.ros.topics import DRIVING, readers_of, without_numbers, writers_of
@@ -70,11 +69,8 @@ class PolicyNode(Node):
             )
         cameras = self._cameras()
         defaults = FrameSettings()
-        policy = rcdsac_trl.load(agent)
-        if self._given("detours", False):
-            policy.navigator = Navigator(NavigatorSettings(watchdog=None), policy.robot)
         self.driver = Driver(
-            policy,
+            rcdsac_trl.load(agent),
             mount=self._mount(),
             cameras={frame: view_rad for frame, _, view_rad in cameras},
             zero_means=self._given("zero_means", "invalid"),
@@ -84,6 +80,7 @@ class PolicyNode(Node):
                 self._given("localisation_timeout_s", defaults.localisation_timeout_s),
                 self._given("base_frame", "") or None,
             ),
+            detours=self._given("detours", False),
         )
         self._needed = {topic: _CLOUD for _, topic, _ in cameras} or {"scan": _SCAN}
         self._needed |= _NEEDED

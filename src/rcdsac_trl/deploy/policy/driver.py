@@ -61,6 +61,7 @@ class Driver:
         zero_means: what the scanner's driver means by a reading of 0; see :class:`Scan`.
         nan_means: what it means by NaN.
         frames: how the robot's place in the path's frame is known; None for the defaults.
+        detours: give the policy a navigator that leads around what blocks the way; it needs numba.
 
     Attributes:
         beta: how much risk to take; None: the policy's default. May be set at any time.
@@ -77,10 +78,16 @@ class Driver:
         zero_means: Meaning = "invalid",
         nan_means: Meaning = "invalid",
         frames: FrameSettings | None = None,
+        detours: bool = False,
     ) -> None:
         check_meaning("zero_means", zero_means)
         check_meaning("nan_means", nan_means)
         self.policy = policy
+        if detours:
+            # Here, since a driver without them does without numba.
+            from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
+
+            policy.navigator = Navigator(NavigatorSettings(watchdog=None), policy.robot)
         self.beta: float | None = None
         self.situation: Situation | None = None
         self._robot = policy.config.robot
