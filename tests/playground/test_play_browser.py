@@ -172,9 +172,9 @@ def picture(page: Page, name: str, tmp_path: Path) -> None:
 
 
 def test_a_robot_drives_and_beta_turns_it(opened, tmp_path) -> None:
-    page = driving(opened("agent=rcdsac_pow-narrow&beta=-2"))
-    assert field(page, "name") == "rcdsac_pow-narrow"
-    assert field(page, "beta") == "β = -2.00"
+    page = driving(opened("agent=rcdsac_cvar-narrow&beta=0.25"))
+    assert field(page, "name") == "rcdsac_cvar-narrow"
+    assert field(page, "beta") == "β = 0.25"
     assert re.fullmatch(r"-?\d\.\d\d m/s", field(page, "speed"))
     before = seconds(page)
     page.wait_for_function(
@@ -185,20 +185,26 @@ def test_a_robot_drives_and_beta_turns_it(opened, tmp_path) -> None:
     told = field(page, "value")
     page.locator(".noUi-handle").first.focus()
     page.keyboard.press("End")
-    page.wait_for_function("document.querySelector('#robot0 [data-field=beta]').textContent === 'β = 0.00'")
+    page.wait_for_function("document.querySelector('#robot0 [data-field=beta]').textContent === 'β = 1.00'")
     page.wait_for_function(
         "(told) => document.querySelector('#robot0 [data-field=value]').textContent !== told", arg=told
     )
     mean, value = re.findall(r"-?\d+\.\d", field(page, "value"))
     assert mean == value  # neutral: the weighted mean is the mean
-    assert "beta=0" in page.url  # the link opens what is seen
+    assert "beta=1" in page.url  # the link opens what is seen
     picture(page, "one", tmp_path)
 
 
 def test_keys_and_buttons_do_what_they_say(opened) -> None:
     page = driving(opened("agent=rcdsac_cvar-narrow&beta=0.5"))
-    page.keyboard.press("Space")
+    for _ in range(2):
+        page.keyboard.down("Space")  # held: the second one is a repetition
+    page.keyboard.up("Space")
     page.get_by_role("button", name="drive").wait_for()
+    stood = seconds(page)
+    page.get_by_role("button", name="step").focus()
+    page.keyboard.press("Space")
+    page.wait_for_function(f"parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > {stood}")
     stood = seconds(page)
     page.keyboard.press(".")
     page.wait_for_function(f"parseFloat(document.querySelector('#robot0 [data-field=time]').textContent) > {stood}")
@@ -215,8 +221,16 @@ def test_keys_and_buttons_do_what_they_say(opened) -> None:
         page.wait_for_timeout(0 if number else 500)  # who holds it for a moment drags it, too
     until(lambda: obstacles(page) != [[x, y]])
     assert obstacles(page)[0] == pytest.approx([x + 3.0, y], abs=0.15)
+    box = page.locator("#robot0 .map").bounding_box()
+    assert box is not None
+    there = on_map(page, *obstacles(page)[0])
+    page.keyboard.down("Shift")
+    page.mouse.click(box["x"] + there["x"], box["y"] + there["y"])
+    page.keyboard.up("Shift")
+    until(lambda: obstacles(page) == [[-1000.0, -1000.0]])  # away
     page.get_by_role("button", name="stop zone").click()
-    page.wait_for_function("window.location.search.includes('stop=on')")
+    page.get_by_role("button", name="◐").click()
+    page.wait_for_function("window.location.search.endsWith('&stop=on&theme=dark')")
 
 
 def test_a_click_sets_the_goal(opened) -> None:
@@ -247,7 +261,7 @@ def test_choices_add_up_and_one_that_cannot_be_had_is_taken_back(opened) -> None
     second.select_option("mppi")
     page.get_by_role("button", name="next map").click()
     page.get_by_role("button", name="next map").click()
-    page.wait_for_function("window.location.search === '?agent=rcdsac_pow-narrow&beta=-1&seed=2&second=mppi'")
+    page.wait_for_function("window.location.search === '?agent=rcdsac_pow-narrow&beta=-1&seed=2&second=mppi&zoom=off'")
     sensor = page.locator("select").nth(3)
     sensor.select_option("full")
     page.wait_for_function("window.location.search.includes('sensor=full')")
@@ -255,7 +269,7 @@ def test_choices_add_up_and_one_that_cannot_be_had_is_taken_back(opened) -> None
     page.locator("#message", has_text="the office is driven by four cameras").wait_for()
     until(lambda: model(page, "map", "model.value") == "mixed")
     seed = page.locator("#scene input").first
-    for typed, sentence in (("", "seed is empty"), ("1.5", "seed=1.5 is no whole number")):
+    for typed, sentence in (("", "seed is empty"), ("1.5", "seed=1.5 is no whole number"), ("-5", "seed=-5")):
         seed.fill(typed)
         seed.press("Enter")
         page.locator("#message", has_text=sentence).wait_for()
@@ -321,9 +335,9 @@ def test_zoomed_in_each_map_follows_its_robot_and_a_message_moves_nothing(opened
         assert middle == pytest.approx(places(page, name)[-1][0])
     page.get_by_role("button", name="zoom in").click()
     until(lambda: model(page, "map1", "model.x_range.end - model.x_range.start") == pytest.approx(20.8))
-    for _ in range(5):
+    for _ in range(2):
         page.keyboard.press("o")
-    page.locator("#message", has_text="4 obstacles are there already").wait_for()
+    page.locator("#message", has_text="an obstacle stands there already").wait_for()
     assert page.locator("#stage").bounding_box() == before
 
 
@@ -360,3 +374,31 @@ def test_two_robots_stand_side_by_side_in_a_narrow_window_too(opened, tmp_path) 
     assert page.evaluate(beside)
     assert page.evaluate("document.documentElement.scrollWidth") <= 420  # nothing sticks out
     picture(page, "narrow", tmp_path)
+
+
+LAID_OUT = """() => {
+    const inside = (element) => [...element.children, ...(element.shadowRoot ? element.shadowRoot.children : [])];
+    const leaves = (element) => element.matches("span, button, .bk-slider-title, .noUi-target")
+        ? [element] : inside(element).flatMap(leaves);
+    const boxes = leaves(document.querySelector("#bar")).map((element) => [element, element.getBoundingClientRect()])
+        .filter(([element, box]) => box.width && element.textContent.trim() !== "" || element.matches(".noUi-target"))
+        .filter(([, box]) => box.width);
+    const wrong = [];
+    boxes.forEach(([one, a], number) => boxes.slice(number + 1).forEach(([other, b]) => {
+        const across = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+        if (across > 1.5 && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 1.5)
+            wrong.push([one.textContent, other.textContent, across]);
+    }));
+    return { count: boxes.length, wrong, width: document.documentElement.scrollWidth };
+}"""
+
+
+def test_nothing_in_the_bar_lies_over_anything_else_at_any_width(opened) -> None:
+    page = standing(opened("agent=rcdsac_pow_wide-narrow&second=rcdsac_cvar-narrow&paused=on"))
+    for width in (1280, 1000, 870, 768, 620, 390):
+        page.set_viewport_size({"width": width, "height": 800})
+        page.wait_for_function("(width) => window.innerWidth === width", arg=width)
+        until(lambda width=width: page.evaluate(LAID_OUT)["width"] <= width)
+        laid_out = page.evaluate(LAID_OUT)
+        assert laid_out["wrong"] == [], width
+        assert laid_out["count"] >= 18  # buttons, sliders with their titles, and what their ends mean

@@ -187,13 +187,27 @@ def test_obstacles_cannot_stand_in_a_robot_or_outside_and_are_not_too_many(map_:
             scene.put_obstacle(-1.0, y)
         with pytest.raises(UserInputError, match="there is no obstacle 0"):
             scene.move_obstacle(0, x + 1.0, y)
-        for _ in range(4):
-            scene.put_obstacle(x + 1.0, y)
+        away = [1.0 + 0.62 * number for number in range(4)]
+        scene.put_obstacle(x + away[0], y)
+        with pytest.raises(UserInputError, match="stands there already"):
+            scene.put_obstacle(x + 1.5, y + 0.1)
+        for shift in away[1:]:
+            scene.put_obstacle(x + shift, y)
         with pytest.raises(UserInputError, match="4 obstacles are there already"):
-            scene.put_obstacle(x + 1.0, y)
+            scene.put_obstacle(x, y + 1.0)
         with pytest.raises(UserInputError, match="cannot stand in the robot"):
             scene.move_obstacle(3, x, y)
-        assert scene.robots[0].arena.simulation.put_discs[:, 0] == pytest.approx(x + 1.0)
+        with pytest.raises(UserInputError, match="stands there already"):
+            scene.move_obstacle(3, x + away[2], y)
+        scene.move_obstacle(3, x + away[3] + 0.1, y)  # its own place is not taken
+        scene.put_or_take_obstacle(x + away[1], y + 0.2)  # takes the second away
+        with pytest.raises(UserInputError, match=r"no obstacle 1: those that stand are \[0, 2, 3\]"):
+            scene.move_obstacle(1, x, y + 1.0)
+        far = scene.robots[0].arena.simulation.put_discs[1]
+        assert np.linalg.norm(far[:2]) > 1000.0
+        scene.put_or_take_obstacle(x, y + 1.0)  # and puts it elsewhere
+        places = [(x + away[0], y), (x, y + 1.0), (x + away[2], y), (x + away[3] + 0.1, y)]
+        assert scene.robots[0].arena.simulation.put_discs[:, :2] == pytest.approx(np.array(places))
 
 
 def test_a_push_moves_the_robot_aside_as_far_as_there_is_room() -> None:
@@ -286,6 +300,11 @@ def test_maps_of_ones_own_are_offered_by_name_and_driven(tmp_path: Any) -> None:
     with contextlib.closing(Drive(SceneChoice("sac-narrow", map="hall"), offered)) as scene:
         scene.step()
         assert scene.robots[0].arena.map.size_m == 12.0
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "hall.json").write_text((tmp_path / "hall.json").read_text())
+    both = (str(tmp_path / "hall.json"), str(tmp_path / "more" / "hall.json"))
+    with pytest.raises(UserInputError, match="two maps are called hall: rename the file of one"):
+        offers_of(PlaySettings(None, both, "localhost", 0, (), False, 1, "films"))
     (tmp_path / "mixed.json").write_text((tmp_path / "hall.json").read_text())
     with pytest.raises(UserInputError, match="a map set is called mixed: rename the file"):
         offers_of(PlaySettings(None, (str(tmp_path / "mixed.json"),), "localhost", 0, (), False, 1, "films"))

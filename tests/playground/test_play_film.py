@@ -41,7 +41,7 @@ def test_a_film_of_nothing_is_refused_in_a_sentence(tmp_path: Path) -> None:
     until(lambda: clock.newest is not None)
     studio.queue(clock)
     until(lambda: "no film" in studio.told(clock)[0])
-    assert "film at least one step" in studio.told(clock)[0]
+    assert "nothing was driven yet" in studio.told(clock)[0]
     clock.close(PATIENCE_S)
 
 

@@ -59,9 +59,9 @@ def status_of(server: PlayServer, origin: str | None) -> int:
     return IOLoop.current().run_sync(connect)
 
 
-def _get(server: PlayServer, path: str, name: str | None = None) -> str:
+def _get(server: PlayServer, path: str, name: str | None = None, **further: str) -> str:
     """Fetch a page, as a browser does that knows the server by some name."""
-    headers = {} if name is None else {"Host": name}
+    headers = further if name is None else {"Host": name, **further}
     asked = urllib.request.Request(f"http://localhost:{server.port}{path}", headers=headers)
 
     async def fetch() -> str:
@@ -71,10 +71,10 @@ def _get(server: PlayServer, path: str, name: str | None = None) -> str:
     return IOLoop.current().run_sync(fetch)
 
 
-def _refused(server: PlayServer, path: str, name: str | None = None) -> tuple[int, str]:
+def _refused(server: PlayServer, path: str, name: str | None = None, **further: str) -> tuple[int, str]:
     """Return the status of an answer, and its sentence."""
     with pytest.raises(urllib.error.HTTPError) as refused:
-        _get(server, path, name)
+        _get(server, path, name, **further)
     with refused.value as answer:
         page = answer.read().decode()
     told = re.search(r'<p id="sentence">(.*?)\. ?(<a|</p>)', page)
@@ -110,6 +110,28 @@ def test_only_known_origins_are_let_in(server: PlayServer, origin: str, status: 
 
 
 @pytest.mark.parametrize(
+    ("site", "dest", "comes_in"),
+    [
+        ("cross-site", "image", False),
+        ("cross-site", "empty", False),
+        ("cross-site", "document", True),  # a link
+        ("cross-site", "iframe", True),  # a notebook's
+        ("same-origin", "empty", True),
+        ("none", "document", True),
+    ],
+)
+def test_a_page_of_elsewhere_takes_no_place_with_what_it_does_not_show(
+    server: PlayServer, site: str, dest: str, comes_in: bool
+) -> None:
+    asked = {"Sec-Fetch-Site": site, "Sec-Fetch-Dest": dest}
+    if comes_in:
+        assert "static/js/bokeh.min.js" in _get(server, "/", **asked)
+    else:
+        assert _refused(server, "/", **asked)[0] == 403
+    assert len(server._pages) == comes_in
+
+
+@pytest.mark.parametrize(
     ("query", "sentence"),
     [
         ("seed=-1", "seed=-1 is no whole number"),
@@ -121,7 +143,11 @@ def test_only_known_origins_are_let_in(server: PlayServer, origin: str, status: 
         ("map=office&sensor=full&agent=sac-narrow", "the office is driven by four cameras"),
         ("theme=pink", "theme=pink is none of light, dark"),
         ("paused=%ff%00", "paused=\ufffd? is none of on, off"),
-        ("bokeh-session-id=x", "the link has no key bokeh-session-id"),
+        (
+            "bokeh-session-id=x",
+            "the link has no key bokeh-session-id: it may have agent, beta, map, seed, sensor, second, beta2, "
+            "stop, theme",
+        ),
     ],
 )
 def test_a_bad_link_gets_a_sentence_before_a_page_is_made(

@@ -19,7 +19,7 @@ from bokeh.models import (
 
 from rcdsac_trl.playground.drive_clock import SPEEDS, View
 from rcdsac_trl.playground.offers import Offers
-from rcdsac_trl.playground.scene_choice import AS_TRAINED, LARGEST_SEED, NOBODY
+from rcdsac_trl.playground.scene_choice import AS_TRAINED, NOBODY
 from rcdsac_trl.playground.silence import Silence
 from rcdsac_trl.playground.visitor import Visitor
 from rcdsac_trl.robot.range_sensor import SENSORS
@@ -113,11 +113,11 @@ class Controls:
         """Make what a scene is chosen with, by the scene's fields."""
         select = partial(self._made, Select)
         return {
-            "agent": select("agent", title="who drives", options=offers.drivers, width=190),
-            "second": select("second", title="beside it", options=[NOBODY, *offers.drivers], width=190),
+            "agent": select("agent", title="who drives", options=offers.drivers, width=215),
+            "second": select("second", title="beside it", options=[NOBODY, *offers.drivers], width=215),
             "map": select("map", title="map", options=offers.places, width=110),
             "sensor": select("sensor", title="sensor", options=[AS_TRAINED, *sorted(SENSORS)], width=100),
-            "seed": self._made(Spinner, "seed", title="seed", low=0, high=LARGEST_SEED, step=1, value=0, width=90),
+            "seed": self._made(Spinner, "seed", title="seed", step=1, value=0, width=90),
         }
 
     def _made(self, kind: type, name: str, **given: Any) -> Any:
@@ -139,9 +139,10 @@ class Controls:
             for key, field in self._fields.items():
                 field.update(value=getattr(choice, key))
             self._stop.active = choice.stop
-            for slider, robot in zip(self.betas, view.robots, strict=False):
+            sides = ("left", "right") if len(view.robots) == 2 else ("",)
+            for slider, robot, side in zip(self.betas, view.robots, sides, strict=False):
                 dial = robot.dial
                 slider.update(visible=dial is not None, disabled=dial is None)
                 if dial is not None:
                     slider.update(start=dial.low, end=dial.high, value=robot.dialled)
-                    slider.title = f"{dial.symbol} of {robot.name}"
+                    slider.title = f"{dial.symbol} {side}" if side else f"{dial.symbol} of {robot.name}"

@@ -128,6 +128,10 @@ class DriveClock:
         """Go on, or pause."""
         self._order(lambda: setattr(self, "_running", on))
 
+    def toggle(self) -> None:
+        """Pause where it drives then, else go on."""
+        self._order(lambda: setattr(self, "_running", not self._running))
+
     def step_once(self) -> None:
         """Pause, and take one step."""
 

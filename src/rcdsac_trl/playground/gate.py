@@ -64,6 +64,9 @@ class _Refused(Matcher):
             return {"status": _NOWHERE, "sentence": f"there is no {shortened(request.path)} here: the page is at /"}
         if request.path != "/" or request.method != "GET":
             return None
+        if _is_of_elsewhere(request.headers):
+            sentence = "another page asks for this one, and shows it to nobody: open it in a tab of its own"
+            return {"status": _UNKNOWN_NAME, "sentence": sentence}
         try:
             self._check(query_of(request.arguments))
         except TooManyPages as error:
@@ -71,6 +74,12 @@ class _Refused(Matcher):
         except UserInputError as error:
             return {"status": _BAD_LINK, "sentence": str(error)}
         return None
+
+
+def _is_of_elsewhere(headers: HTTPHeaders) -> bool:
+    """Return whether a page of another site loads this one as a picture or the like, which would take a place here."""
+    is_shown = headers.get("Sec-Fetch-Dest", "document") in ("document", "iframe")
+    return headers.get("Sec-Fetch-Site") == "cross-site" and not is_shown
 
 
 def _answer(request: HTTPServerRequest, status: int, sentence: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from rcdsac_trl.config.named_folder import find_agent
 from rcdsac_trl.deploy import Weights, shipped_names
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.playground.scene_choice import shortened
+from rcdsac_trl.playground.scene_choice import NOBODY, shortened
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.map_source import MapSource, check_maps, with_digests
@@ -54,6 +54,8 @@ class Offers:
             name = Path(run).resolve().name if Path(run).is_dir() else run
             if name in agents or name in PLANNERS:
                 raise UserInputError(f"two agents are called {name}: rename the folder of one of them")
+            if name == NOBODY:
+                raise UserInputError(f"no agent can be called {NOBODY}, which means no second robot: rename its folder")
             agents[name] = run
         if not agents:
             raise UserInputError("no agent is shipped with this version: name who drives with run=<folder>")

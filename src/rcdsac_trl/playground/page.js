@@ -42,9 +42,12 @@ if (film.dataset.shown !== JSON.stringify(state.film)) {
     film.append(" ", link);
   }
 }
-const asked = new URLSearchParams(window.location.search);
-const kept = ["theme", "zoom"].filter((key) => asked.has(key)).map((key) => "&" + key + "=" + asked.get(key));
-const query = "?" + state.query + kept.join("");
+// What the page shows of itself stands in the link where it is not as usual, or where the link had said it.
+window.playAsked = window.playAsked || new URLSearchParams(window.location.search);
+const own = { theme: state.theme, zoom: state.zoom };
+const usual = { theme: window.matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light", zoom: state.usual_zoom };
+const kept = Object.keys(own).filter((key) => window.playAsked.has(key) || own[key] !== usual[key]);
+const query = "?" + state.query + kept.map((key) => "&" + key + "=" + own[key]).join("");
 if (!state.refused && window.location.search !== query) window.history.replaceState(null, "", query);
 
 if (window.playKeys === undefined) {
@@ -55,11 +58,30 @@ if (window.playKeys === undefined) {
     // Another Bokeh, which keeps its threshold elsewhere.
   }
   window.playKeys = 0;
+  const isHandle = (at) => Boolean(at.classList && at.classList.contains("noUi-handle"));
+  // noUiSlider keeps the ends that it was made with; here they change with the agent.
+  window.addEventListener("keydown", (event) => {
+    const path = event.composedPath();
+    if (!isHandle(path[0]) || !["Home", "End"].includes(event.key)) return;
+    const second = path.some((element) => element.classList && element.classList.contains("second"));
+    const slider = second ? beta1 : beta0;
+    slider.value = event.key === "Home" ? slider.start : slider.end;
+    event.preventDefault();
+    event.stopPropagation();
+  }, { capture: true });
+  // Who clicks means the drive with the next key, not what was clicked: only who tabs there works it by keys.
+  window.addEventListener("click", (event) => {
+    const at = event.composedPath().find((element) => element.matches && element.matches("button, summary"));
+    if (at && event.detail > 0) at.blur();
+  });
   window.addEventListener("keydown", (event) => {
     const at = event.composedPath()[0];
     const writes = at instanceof HTMLInputElement || at instanceof HTMLSelectElement;
-    if (writes || (at.classList && at.classList.contains("noUi-handle") && event.key.startsWith("Arrow"))) return;
+    if (writes || (isHandle(at) && event.key.startsWith("Arrow"))) return;
     if (event.ctrlKey || event.metaKey || event.altKey) return;
+    // Space works what is focused, and who holds a key means one press.
+    if (event.key === " " && at.matches && at.matches("button, summary")) return;
+    if (event.repeat && [" ", "o"].includes(event.key.toLowerCase())) return event.preventDefault();
     const turned = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
     if (turned) {
       const slider = event.shiftKey ? beta1 : beta0;

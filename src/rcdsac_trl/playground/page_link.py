@@ -26,7 +26,7 @@ class PageLink:
         choice: the scene.
         theme: one of :data:`~rcdsac_trl.playground.palette.THEMES`; None: as the browser has it.
         running: whether it drives at once.
-        zoomed: whether it begins with what is around each robot, which on half a page is small otherwise.
+        zoomed: whether it begins with what is around each robot.
     """
 
     choice: SceneChoice
@@ -50,10 +50,15 @@ def read_link(query: Mapping[str, str], offers: Offers) -> PageLink:
         if value not in _OWN_KEYS[key]:
             raise UserInputError(f"{key}={shortened(value)} is none of {', '.join(_OWN_KEYS[key])}: choose one of them")
     scene = {key: value for key, value in query.items() if key not in own}
-    choice = SceneChoice.of_query(scene, next(iter(offers.agents))) if scene else usual_scene(offers)
+    choice = SceneChoice.of_query(scene, next(iter(offers.agents)), [*_OWN_KEYS]) if scene else usual_scene(offers)
     cast(choice, offers)
-    zoom = own.get("zoom", "off" if choice.second == NOBODY else "on")
-    return PageLink(choice, own.get("theme"), running=own.get("paused") != "on", zoomed=zoom == "on")
+    zoomed = own["zoom"] == "on" if "zoom" in own else zoomed_usually(choice)
+    return PageLink(choice, own.get("theme"), running=own.get("paused") != "on", zoomed=zoomed)
+
+
+def zoomed_usually(choice: SceneChoice) -> bool:
+    """Return whether a scene begins with what is around each robot: two maps side by side are small."""
+    return choice.second != NOBODY
 
 
 def usual_scene(offers: Offers) -> SceneChoice:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rcdsac_trl.playground.drive_clock import View
+from rcdsac_trl.playground.page_link import zoomed_usually
 from rcdsac_trl.playground.scene_choice import NOBODY, SceneChoice
 from rcdsac_trl.playground.view_state import RobotView
 
@@ -24,17 +25,20 @@ def refusal_words(theme: str, sentence: str) -> dict[str, Any]:
         "scene": "",
         "glass": False,
         "query": "",
+        "zoom": "off",
+        "usual_zoom": "off",
         "film": {"told": "", "files": []},
     }
 
 
 def view_words(
-    theme: str, view: View, opening: bool, shown_per_s: float, film: tuple[str, Sequence[str]]
+    theme: str, zoomed: bool, view: View, opening: bool, shown_per_s: float, film: tuple[str, Sequence[str]]
 ) -> dict[str, Any]:
     """Return what a page says of a view.
 
     Args:
         theme: of the page.
+        zoomed: whether what is around each robot is shown.
         view: that is shown.
         opening: whether another scene is being made.
         shown_per_s: how many agent steps a second the browser draws.
@@ -48,6 +52,8 @@ def view_words(
         "message": OPENING if opening else view.message or "",
         "waits": opening,
         "query": choice.query,
+        "zoom": "on" if zoomed else "off",
+        "usual_zoom": "on" if zoomed_usually(choice) else "off",
         "scene": f"{_drivers(choice)}, {choice.map}, seed {choice.seed}",
         "glass": bool(view.glass),
         "rate": f"{shown_per_s:.0f} agent steps/s shown, {view.steps_per_s:.0f} driven" if view.running else "",

@@ -3,13 +3,14 @@
 Nothing here knows of a browser: it is stepped, and told what to do.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from rcdsac_trl.deploy import Command
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.playground.arenas import MOST_OBSTACLES, Arena, CourseArena, MapArena
+from rcdsac_trl.playground.arenas import MOST_OBSTACLES, OBSTACLE_RADIUS_M, Arena, CourseArena, MapArena
 from rcdsac_trl.playground.cast import cast
 from rcdsac_trl.playground.drivers import AgentDriver, Driver
 from rcdsac_trl.playground.offers import OFFICE, Offers
@@ -19,6 +20,9 @@ from rcdsac_trl.world.task.rules import TaskSettings
 
 TRAIL_STEPS = 400
 """So many steps of its way are kept of a robot."""
+
+# An obstacle that was taken away waits here to be put again, far from all that senses or touches.
+_AWAY_M = (-1000.0, -1000.0)
 
 
 @dataclass
@@ -90,7 +94,6 @@ class Drive:
     Attributes:
         choice: the scene, with the betas that are dialled now.
         robots: one or two.
-        num_obstacles: that were put.
 
     Raises:
         UserInputError: if :func:`~rcdsac_trl.playground.cast.cast` refuses the scene, or its map cannot be made.
@@ -98,7 +101,8 @@ class Drive:
 
     def __init__(self, choice: SceneChoice, offers: Offers) -> None:
         self.choice = choice
-        self.num_obstacles = 0
+        # Where each that was put stands, by its number; None: it was taken away.
+        self._obstacles: list[tuple[float, float] | None] = []
         parts = cast(choice, offers)
         self.robots: list[Robot] = []
         try:
@@ -152,12 +156,14 @@ class Drive:
         Raises:
             UserInputError: if there are too many, or it cannot stand there.
         """
-        if self.num_obstacles == MOST_OBSTACLES:
+        if len(self._obstacles) - self._obstacles.count(None) == MOST_OBSTACLES:
             raise UserInputError(f"{MOST_OBSTACLES} obstacles are there already: drag one of them")
-        for robot in self.robots:
-            robot.arena.check_room(x, y)
-        self._each(lambda arena: arena.put_obstacle(x, y))
-        self.num_obstacles += 1
+        self._check_room(x, y)
+        if None in self._obstacles:
+            self._move(self._obstacles.index(None), (x, y))
+        else:
+            self._each(lambda arena: arena.put_obstacle(x, y))
+            self._obstacles.append((x, y))
 
     def move_obstacle(self, number: int, x: float, y: float) -> None:
         """Move an obstacle in every world.
@@ -165,11 +171,39 @@ class Drive:
         Raises:
             UserInputError: if there is none of that number, or it cannot stand there.
         """
-        if not 0 <= number < self.num_obstacles:
-            raise UserInputError(f"there is no obstacle {number}: {self.num_obstacles} were put")
+        if number not in self._standing():
+            raise UserInputError(f"there is no obstacle {number}: those that stand are {sorted(self._standing())}")
+        self._check_room(x, y, number)
+        self._move(number, (x, y))
+
+    def put_or_take_obstacle(self, x: float, y: float) -> None:
+        """Take away the obstacle that stands at a place, m; where none does, put one.
+
+        Raises:
+            UserInputError: if there are too many, or it cannot stand there.
+        """
+        for number, place in self._standing().items():
+            if math.dist(place, (x, y)) < OBSTACLE_RADIUS_M:
+                self._move(number, _AWAY_M)
+                self._obstacles[number] = None
+                return
+        self.put_obstacle(x, y)
+
+    def _move(self, number: int, place: tuple[float, float]) -> None:
+        self._each(lambda arena: arena.move_obstacle(number, *place))
+        self._obstacles[number] = place
+
+    def _standing(self) -> dict[int, tuple[float, float]]:
+        """Return where the obstacles stand that were not taken away, by their numbers."""
+        return {number: place for number, place in enumerate(self._obstacles) if place is not None}
+
+    def _check_room(self, x: float, y: float, moved: int | None = None) -> None:
+        """Refuse a place for an obstacle, new or moved, that is taken or outside."""
         for robot in self.robots:
             robot.arena.check_room(x, y)
-        self._each(lambda arena: arena.move_obstacle(number, x, y))
+        for number, place in self._standing().items():
+            if number != moved and math.dist(place, (x, y)) < 2.0 * OBSTACLE_RADIUS_M:
+                raise UserInputError("an obstacle stands there already: put it beside that one, or drag it")
 
     def push(self, side: float) -> None:
         """Push all robots to their left (1.0) or to their right (-1.0)."""

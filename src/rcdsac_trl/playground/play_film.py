@@ -65,6 +65,8 @@ class FilmStudio:
     def _make(self, clock: DriveClock, tracks: list[list[Moment]], headings: list[str], period_s: float) -> None:
         with self._one_at_a_time:
             try:
+                if tracks and not tracks[0]:
+                    raise UserInputError("nothing was driven yet: let it drive, or take a step")
                 self._folder.mkdir(parents=True, exist_ok=True)
                 stem = self._next_stem()
                 named = [Track(heading, track) for heading, track in zip(headings, tracks, strict=True)]

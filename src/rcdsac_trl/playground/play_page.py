@@ -23,6 +23,7 @@ from rcdsac_trl.playground.palette import style_sheet
 from rcdsac_trl.playground.play_film import FilmStudio
 from rcdsac_trl.playground.stage import Stage
 from rcdsac_trl.playground.visitor import Visitor
+from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY
 
 _HERE = Path(__file__).parent
 _TEMPLATE, _STYLE, _CODE, _LOST = (
@@ -88,7 +89,9 @@ class PlayPage:
                 document.add_root(root)
         document.title = "rcdsac_trl: play"
         document.template = _TEMPLATE
-        document.template_variables.update(palettes=style_sheet(), page_css=_STYLE, opening=OPENING)
+        document.template_variables.update(
+            palettes=style_sheet(), page_css=_STYLE, opening=OPENING, fastest=f"{MAX_LINEAR_VELOCITY:g}"
+        )
         document.js_on_event(DocumentReady, CustomJS(args={"theme": switch, "asked": theme or ""}, code=_TAKE_THEME))
         document.on_event(DocumentReady, lambda event: self._begin())
         document.config.update(reconnect_session=False, notify_connection_status=False)
@@ -137,7 +140,7 @@ class PlayPage:
 
     def _say(self, view: View) -> None:
         opening, film = self._said_aside = self._aside()
-        self._write(view_words(self._theme, view, opening, self._rate(), film))
+        self._write(view_words(self._theme, self._controls.zoomed, view, opening, self._rate(), film))
 
     def _write(self, words: dict[str, Any]) -> None:
         self._wire.text = json.dumps(words)
@@ -145,6 +148,7 @@ class PlayPage:
     def _look_around(self) -> None:
         if self._view is not None:
             self._stage.look(self._view, self._controls.zoomed)
+            self._say(self._view)
 
     def _restyle(self, theme: str) -> None:
         self._theme = theme

@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from rcdsac_trl.config.named_world import generated_sets, map_set
 from rcdsac_trl.config.play_settings import PlaySettings
 from rcdsac_trl.config.run_config import read_config
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.offers import Offers
 from rcdsac_trl.playground.play_server import PlayServer, is_loopback, what_it_means
 from rcdsac_trl.system.progress import serving
@@ -36,7 +37,7 @@ def make_session(cfg: DictConfig) -> PlaySession:
     """Read what is offered.
 
     Raises:
-        UserInputError: for an agent or a map that cannot be read.
+        UserInputError: for an agent or a map that cannot be read, and a name that stands for two.
     """
     settings = read_config(cfg, PlaySettings)
     return PlaySession(settings, offers_of(settings))
@@ -45,7 +46,12 @@ def make_session(cfg: DictConfig) -> PlaySession:
 def offers_of(settings: PlaySettings) -> Offers:
     """Return agents and maps that settings name, with the map sets of ``conf/map/``."""
     sets = {name: map_set(name) for name in generated_sets()}
-    files = {Path(path).stem: FileMapSettings(path=path) for path in settings.maps}
+    files: dict[str, FileMapSettings] = {}
+    for path in settings.maps:
+        name = Path(path).stem
+        if name in files:
+            raise UserInputError(f"two maps are called {name}: rename the file of one of them")
+        files[name] = FileMapSettings(path=path)
     return Offers.of(settings.runs, dict(sorted(sets.items(), key=lambda item: item[0] != "mixed")), files)
 
 

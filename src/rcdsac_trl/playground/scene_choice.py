@@ -56,12 +56,13 @@ class SceneChoice:
             raise _no_seed(f"={self.seed}")
 
     @classmethod
-    def of_query(cls, query: Mapping[str, str], agent: str = "") -> "SceneChoice":
+    def of_query(cls, query: Mapping[str, str], agent: str = "", others: Sequence[str] = ()) -> "SceneChoice":
         """Read a link's query.
 
         Args:
             query: values by key.
             agent: who drives where the query does not say it.
+            others: keys that a link may have besides, for the sentence that names all.
 
         Raises:
             UserInputError: for an unknown key, or a value that cannot be read.
@@ -70,7 +71,9 @@ class SceneChoice:
         values: dict[str, str | float | int | bool] = {"agent": agent}
         for key, text in query.items():
             if key not in known:
-                raise UserInputError(f"the link has no key {shortened(key)}: it may have {', '.join(known)}")
+                raise UserInputError(
+                    f"the link has no key {shortened(key)}: it may have {', '.join([*known, *others])}"
+                )
             values[key] = _read(key, text)
         return cls(**values)  # type: ignore[arg-type]
 

@@ -50,12 +50,12 @@ class Visitor:
         self._tell(lambda drive: drive.push(side))
 
     def tap(self, event: Tap) -> None:
-        """Send the robots somewhere, or put an obstacle there."""
+        """Send the robots somewhere, or put an obstacle there, or take the one away that is there."""
         x, y = event.x, event.y
         if x is None or y is None or not (math.isfinite(x) and math.isfinite(y)):
             return
         if event.modifiers is not None and event.modifiers["shift"]:
-            self._tell(lambda drive: drive.put_obstacle(x, y))
+            self._tell(lambda drive: drive.put_or_take_obstacle(x, y))
         else:
             self._tell(lambda drive: drive.set_goal(x, y))
 
@@ -79,10 +79,9 @@ class Visitor:
 
     def press(self, key: str) -> None:
         """Do what a key stands for."""
-        newest = self._clock.newest
         match key:
             case " ":
-                self.pause(newest is None or newest.running)
+                self._clock.toggle()
             case ".":
                 self.step()
             case "o":
