@@ -26,7 +26,7 @@ from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.rollout.worker import EpisodeBatch, side_by_side
 from rcdsac_trl.rollout.worker_processes import Drive, RolloutRequest, WorkerProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress
-from rcdsac_trl.system import process_pool
+from rcdsac_trl.system import liveness
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.world.task.env import make_env
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -214,6 +214,10 @@ class Clock:
     def __init__(self, passes: Callable[[], bool]) -> None:
         self._passes, self.now_s = passes, 0.0
 
+    def runs(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(liveness, "time", self)
+        monkeypatch.setattr(liveness, "_LONGEST_LOOK_S", TIMEOUT_S)
+
     def monotonic(self) -> float:
         self.now_s += 0.9 * TIMEOUT_S * self._passes()
         return self.now_s
@@ -236,7 +240,7 @@ def test_slow_processes_that_take_steps_do_not_count_as_hung(
         return True
 
     clock = Clock(both_have_stepped)
-    monkeypatch.setattr(process_pool, "time", clock)
+    clock.runs(monkeypatch)
     assert group.ask(SECOND)["action"][:, 0, 0].tolist() == [pid % 1000 for pid in pids]
     assert clock.now_s > 3 * TIMEOUT_S
 
@@ -245,7 +249,7 @@ def test_a_process_that_takes_no_step_is_named(
     processes: Callable[..., WorkerProcesses], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     group = processes(partial(answering, "answers"), partial(answering, "sleeps", tmp_path / "never"))
-    monkeypatch.setattr(process_pool, "time", Clock(lambda: not group.pool._open_requests[0]))
+    Clock(lambda: not group.pool._open_requests[0]).runs(monkeypatch)
     with pytest.raises(WorkerError, match=r"^worker process 2 of 2 \(agents 1\) made no step within 5 s$"):
         group.ask(SECOND)
 

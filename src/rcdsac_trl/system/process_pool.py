@@ -4,7 +4,6 @@ import contextlib
 import multiprocessing
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from multiprocessing import forkserver
@@ -12,6 +11,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
 from rcdsac_trl.system.interrupts import interruption_point
+from rcdsac_trl.system.liveness import Liveness
 from rcdsac_trl.system.processes import START_METHOD, WorkerError, check_may_start_processes, ending
 from rcdsac_trl.system.progress import Watch
 
@@ -42,8 +42,8 @@ class ProcessPool:
         makes: what makes each process's server, there; must pickle.
         names: of the processes, for messages.
         module: what they import, imported once.
-        timeout_s: seconds without a step after which a process counts as hung, while one waits for it; None: it never
-            does.
+        timeout_s: seconds without a step after which a process counts as hung, while one waits for it; see
+            :class:`~rcdsac_trl.system.liveness.Liveness`. None: it never does.
 
     Attributes:
         processes: the processes, in the order of their names.
@@ -63,7 +63,7 @@ class ProcessPool:
         self._connections: list[Connection] = []
         self._steps: list[Any] = []
         self._open_requests = [0] * len(makes)
-        self._seen: list[tuple[int, float]] = [(0, 0.0)] * len(makes)
+        self._liveness: dict[int, Liveness] = {}
         self._hung: set[int] = set()
         preload(module)
         context: Any = multiprocessing.get_context(START_METHOD)
@@ -109,8 +109,11 @@ class ProcessPool:
         Raises:
             WorkerError: if a process ends before its work does, or hangs.
         """
-        now_s = time.monotonic()  # nobody looked before
-        self._seen = [(steps.value, now_s) for steps in self._steps]
+        if self._timeout_s is not None:  # nobody looked before
+            self._liveness = {
+                number: Liveness(process.pid, self._timeout_s, self._steps[number].value)
+                for number, process in enumerate(self.processes)
+            }
         while busy := [number for number, requests in enumerate(self._open_requests) if requests]:
             by_connection = {self._connections[number]: number for number in busy}
             answered = cast(list[Connection], wait(list(by_connection), timeout=_LOOK_S if until_done else 0.0))
@@ -121,7 +124,8 @@ class ProcessPool:
                     with self._reporting(number):
                         answer = connection.recv()
                     self._open_requests[number] -= 1
-                    self._seen[number] = self._steps[number].value, time.monotonic()
+                    if number in self._liveness:
+                        self._liveness[number].renew(self._steps[number].value)
                     yield number, answer
                 else:
                     self._check_steps(number)
@@ -130,10 +134,7 @@ class ProcessPool:
                 watch(sum(steps.value for steps in self._steps))
 
     def _check_steps(self, number: int) -> None:
-        now_s, (seen, seen_s) = time.monotonic(), self._seen[number]
-        if self._steps[number].value != seen:
-            self._seen[number] = self._steps[number].value, now_s
-        elif self._timeout_s is not None and now_s - seen_s > self._timeout_s:
+        if number in self._liveness and self._liveness[number].hangs(self._steps[number].value):
             self._hung.add(number)
             raise self._error(number)
 
