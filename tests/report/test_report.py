@@ -454,7 +454,13 @@ def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
     with_collisions(run / "evaluation" / "best", [(-2.0, "mover", 0, 0.2)])
     folders = [run, evaluate(tmp_path / "sac", "sac", {NONE: 3})]
     out = tmp_path / "out"
-    write_report(Results(read_episodes(folders), folders), out)
+    out.mkdir()
+    for name in ("claims.md", "course.md", "beta_response_cvar.png", "differences_reward_sparse.png"):
+        (out / name).touch()  # an earlier report of something else
+    results = Results(read_episodes(folders), folders)
+    write_report(results, out)
+    with pytest.raises(UserInputError, match="holds something else than a report"):
+        write_report(results, folders[1])
     assert {path.name for path in out.iterdir()} == {
         *(f"table.{suffix}" for suffix in ("md", "csv", "tex", "html")),
         *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "averages", "collision_summary")),

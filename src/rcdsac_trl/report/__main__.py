@@ -7,11 +7,11 @@ from omegaconf import DictConfig
 
 from rcdsac_trl.cli import Command
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.report.folder import check_report_folder
 from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.read_course import is_course, read_courses
 from rcdsac_trl.report.results import Results
 from rcdsac_trl.system.progress import Work
-from rcdsac_trl.system.resources import check_out
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def make_report(cfg: DictConfig) -> Report:
     named = [runs] if isinstance(runs, str) else list(runs or [])
     folders = [Path(str(run)) for run in named]
     out = Path(str(cfg.out))
-    check_out(out)
+    check_report_folder(out)
     courses = [folder for folder in folders if is_course(folder)]
     evaluated = [folder for folder in folders if folder not in courses]
     if courses and not evaluated:

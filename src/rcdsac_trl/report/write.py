@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from rcdsac_trl.report import findings, table
 from rcdsac_trl.report.figures import beta_response, collision_causes, learning_curves, paired_differences
+from rcdsac_trl.report.folder import CLAIMS, check_report_folder, clear_report_folder
 from rcdsac_trl.report.page import page
 from rcdsac_trl.report.results import Results
 from rcdsac_trl.report.sections import lead, sections, title
@@ -17,15 +18,20 @@ def write_report(results: Results, out: Path) -> None:
 
     Args:
         results: what is written.
-        out: the folder; it may exist.
+        out: the folder; where it is an earlier report's, this one takes its place.
+
+    Raises:
+        UserInputError: if it holds something else.
     """
+    check_report_folder(out)
+    clear_report_folder(out)
     out.mkdir(parents=True, exist_ok=True)
+    claims = as_table(results.claims)
+    (out / CLAIMS).write_text(table.markdown(claims), encoding="utf-8")
     table.write_table(results.paper, out / "table")
     if results.course is not None:
         results.course.to_csv(out / "course.csv", index=False)
         (out / "course.md").write_text(table.markdown(results.course), encoding="utf-8")
-    claims = as_table(results.claims)
-    (out / "claims.md").write_text(table.markdown(claims), encoding="utf-8")
     tables = {
         "claims": claims,
         "claims_evidence": evidence(results.claims),

@@ -28,8 +28,8 @@ def processor_time_s(pid: int) -> float | None:
 class Liveness:
     """Watches one process for steps.
 
-    It hangs if it does nothing for `timeout_s`, or computes for so long without a step. On a busy machine it may wait for
-    a processor longer than that. Where the system does not say what a process computes, `timeout_s` without a step
+    It hangs if it does nothing for `timeout_s`, or computes for so long without a step. On a busy machine it may wait
+    for a processor longer than that. Where the system does not say what a process computes, `timeout_s` without a step
     counts.
 
     Args:
