@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.machinery import ModuleSpec
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -88,6 +89,21 @@ def test_unknown_backends_are_refused() -> None:
     LoggerSettings(("csv", "tensorboard")).check_backends()
     with pytest.raises(UserInputError, match=r"logger\.backends holds 'excel': choose among csv, tensorboard, wandb"):
         LoggerSettings(("csv", "excel")).check_backends()
+
+
+def test_wandb_without_a_login_is_refused_before_the_run_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Error(Exception):
+        pass
+
+    def login() -> None:
+        raise Error("No API key configured.")
+
+    wandb = ModuleType("wandb")
+    wandb.__spec__ = ModuleSpec("wandb", None)
+    wandb.login, wandb.errors = login, SimpleNamespace(Error=Error)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    with pytest.raises(UserInputError, match=r"cannot log in \(No API key .*set WANDB_MODE=offline"):
+        LoggerSettings(("csv", "wandb")).check_backends()
 
 
 EXPECTED_SCALARS = {

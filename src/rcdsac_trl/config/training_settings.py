@@ -1,5 +1,6 @@
 """All that a training may choose, checked as a whole."""
 
+import importlib
 import importlib.util
 from dataclasses import dataclass
 from typing import Literal
@@ -13,7 +14,7 @@ from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
-from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.errors import UserInputError, first_line
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
@@ -47,7 +48,9 @@ class LoggerSettings:
     backends: tuple[str, ...]
 
     def check_backends(self) -> None:
-        """Refuse an unknown logger, or one whose package is missing, in a training; an evaluation of it needs none.
+        """Refuse an unknown logger, one whose package is missing, or one without a login, in a training.
+
+        An evaluation of it needs none.
 
         Raises:
             UserInputError: naming the logger.
@@ -59,6 +62,20 @@ class LoggerSettings:
                 raise UserInputError(
                     f"logger {backend} is not installed: pip install 'rcdsac-trl[{backend}]', or use logger=default"
                 )
+        if "wandb" in self.backends:
+            _log_in_to_wandb()
+
+
+def _log_in_to_wandb() -> None:
+    """Log in where W&B is not offline: it would ask, or fail, once the run has begun."""
+    wandb = importlib.import_module("wandb")
+    try:
+        wandb.login()
+    except wandb.errors.Error as error:
+        raise UserInputError(
+            f"logger wandb cannot log in ({first_line(error)}): call `wandb login`, or set WANDB_MODE=offline, which "
+            "keeps everything in the run folder"
+        ) from error
 
 
 @dataclass(frozen=True)
