@@ -26,11 +26,10 @@ each other: they meet in these keys, each with the shape of one agent's entry.
 | `recurrent_state` | 128 f32 | zero at reset, not in the replay; 257 with `network.restart_steps` | actor | actor |
 """
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rcdsac_trl.config import gymnasium_id
+from rcdsac_trl.config.gymnasium_id import register_with_gymnasium
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy import Policy
@@ -52,7 +51,6 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
     Raises:
         rcdsac_trl.errors.UserInputError: if there is no such agent, or it cannot be read.
     """
-    _register_beside_gymnasium()
     # Imported late, so that importing the package stays instant.
     from rcdsac_trl.deploy import Policy, find_weights, read_weights
 
@@ -78,31 +76,9 @@ def world_settings(**options: Any) -> "WorldSettings":
         >>> world_settings(map="easy", sensor="sparse", num_agents=2).map_settings.num_movers
         0
     """
-    _register_beside_gymnasium()
     from rcdsac_trl.config.named_world import named_world
 
     return named_world(**options)
 
 
-def register_gym() -> None:
-    """Register ``RCDSACNavigation-v0`` with Gymnasium, for ``gymnasium.make``; harmless when done before.
-
-    Needed only where this package is imported before Gymnasium: else importing it registers the name, as do
-    :func:`load` and :func:`world_settings`.
-
-    Example:
-        >>> import gymnasium
-        >>> register_gym()
-        >>> env = gymnasium.make("RCDSACNavigation-v0", map="hard", robot="turtlebot4", sensor="sparse")
-    """
-    gymnasium_id.register()
-
-
-def _register_beside_gymnasium() -> None:
-    """Register the name where Gymnasium is there already: importing it takes longer than all else here."""
-    if "gymnasium" in sys.modules:
-        register_gym()
-
-
-# gymnasium.make("rcdsac_trl:RCDSACNavigation-v0") imports this module first, and then looks for the name.
-_register_beside_gymnasium()
+register_with_gymnasium()

@@ -16,7 +16,6 @@ from rcdsac_trl.world.task.gymnasium_env import NavigationGymEnv
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
 ENV_ID = "RCDSACNavigation-v0"
-rcdsac_trl.register_gym()
 
 
 def test_names_are_those_of_the_command_line() -> None:

@@ -12,7 +12,6 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
-import rcdsac_trl
 from rcdsac_trl.config.gymnasium_id import ENV_ID
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
@@ -44,7 +43,6 @@ def test_what_is_no_setting_and_no_option_is_refused() -> None:
 
 @pytest.mark.parametrize("sensor", ["narrow", "sparse", "full"])
 def test_gymnasiums_own_check_passes(sensor: str) -> None:
-    rcdsac_trl.register_gym()  # another test may have imported the package before Gymnasium
     env = gymnasium.make(ENV_ID, map_settings=SMALL, sensor=sensor, render_mode="rgb_array")
     check_env(env.unwrapped)
     env.close()
@@ -54,17 +52,19 @@ def run(code: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_the_id_is_registered_on_request_and_not_before() -> None:
+def test_the_id_is_registered_when_gymnasium_comes_later_and_costs_nothing_before() -> None:
     code = (
         "import sys, rcdsac_trl\n"
+        "finders = len(sys.meta_path)\n"
         "assert not {'torch', 'gymnasium', 'pybullet'} & set(sys.modules)\n"
-        "rcdsac_trl.register_gym()\n"
-        "rcdsac_trl.register_gym()\n"
+        "import importlib; importlib.reload(rcdsac_trl)\n"
+        "assert len(sys.meta_path) == finders\n"
         "import gymnasium\n"
         f"assert gymnasium.spec({ENV_ID!r}).entry_point == 'rcdsac_trl.config.named_world:gymnasium_env'\n"
+        "assert len(sys.meta_path) == finders - 1\n"
+        "importlib.reload(rcdsac_trl)\n"
     )
     run(code)
-    rcdsac_trl.register_gym()
 
 
 @pytest.mark.parametrize(
