@@ -24,6 +24,7 @@ from rcdsac_trl.experiments.sweep import Job, State, execute
 from rcdsac_trl.seeding import torch_seed
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.system.invocation import program
+from rcdsac_trl.system.progress import Work, counted, never_silent
 from rcdsac_trl.tables import read_growing
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ CONFIG = "search"
 _OWN = ("search", "space")
 _FOLDER = "folder"
 _LOCK = "search.lock"  # held by the search whose trial it is: the training takes its own only seconds later
+_SILENCE_S = 60.0  # a trial takes many minutes, and its own folder tells more
 _NEIGHBOURS = 3  # trials that must have come as far before a median says anything
 
 
@@ -119,14 +121,21 @@ class Search:
 
     def run(self) -> None:
         """Try until there are as many trials as asked for; then tell the best one."""
-        while (done := len(self._done())) < self.settings.trials:
-            self._take_up_what_was_lost()
-            trial = self.study.ask()
-            state = self._try(trial)
-            value = self._tell(trial, state)
-            print(f"{done + 1}/{self.settings.trials} {self._described(trial, state, value)}", flush=True)
-            if state.name == "interrupted":
-                raise KeyboardInterrupt
+        settings = self.settings
+        left = max(0, settings.trials - len(self._done()))
+        doing = (
+            f"{counted(left, 'trial')}, each a training, in {self.folder}; search.name={settings.name} goes on there"
+        )
+        with never_silent(_SILENCE_S), Work(doing, left, "trial") as work:
+            while (done := len(self._done())) < settings.trials:
+                self._take_up_what_was_lost()
+                trial = self.study.ask()
+                state = self._try(trial)
+                value = self._tell(trial, state)
+                print(f"{done + 1}/{settings.trials} {self._described(trial, state, value)}", flush=True)
+                if state.name == "interrupted":
+                    raise KeyboardInterrupt
+                work.end_unit()
         self._conclude()
 
     def _done(self) -> set[str]:
