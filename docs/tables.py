@@ -1,7 +1,8 @@
 """Write the tables of README.md and the pages of docs/ anew that follow from files: ``make tables``.
 
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
-``weights/``, and baselines of ``results/``, of which an evaluation is read. The comment of a table of the office course
+``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>`` takes these rows of
+it alone. The comment of a table of the office course
 names the folder of what ``course`` wrote, that of a table of disturbances the files of ``docs/disturbances.py``, in
 their order. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
 
@@ -41,6 +42,7 @@ _COURSE_HEADINGS = (
     *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
     *("in reverse: arrived", "collisions a run", "time, s"),
 )
+_NAMES = {"mppi": "MPPI", "dwa": "DWA", "pursuit": "pure pursuit"}
 _HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goals")
 
 
@@ -55,8 +57,21 @@ def renewed(text: str) -> str:
 
 
 def table_of(names: list[str]) -> str:
-    """Return the table of some agents and baselines, Markdown: a row a condition."""
-    return _markdown(_HEADINGS, [_cells(condition) for name in names for condition in measured_of(name)["conditions"]])
+    """Return the table of some agents and baselines, Markdown: a row a condition.
+
+    Args:
+        names: of each, with ``:`` and betas behind it where not all are to be shown.
+    """
+    return _markdown(_HEADINGS, [_cells(condition) for name in names for condition in _conditions(name)])
+
+
+def _conditions(name: str) -> list[Mapping[str, Any]]:
+    whose, _, chosen = name.partition(":")
+    conditions: list[Mapping[str, Any]] = measured_of(whose)["conditions"]
+    if not chosen:
+        return conditions
+    by_beta = {condition["beta"]: condition for condition in conditions}
+    return [by_beta[float(beta)] for beta in chosen.split(",")]
 
 
 def table_of_course(folder: Path) -> str:
@@ -139,7 +154,8 @@ def _cells(condition: Mapping[str, Any]) -> list[str]:
         for of, form in ((metrics["collisions"], ".2f"), (metrics["reward"], ".0f"))
     )
     free, goals = metrics["collision_free"]["mean"], metrics["goals"]["mean"]
-    return [condition["label"], collisions, reward, f"{100 * free:.0f} %", f"{goals:.2f}"]
+    label = _NAMES.get(condition["label"], condition["label"])
+    return [label, collisions, reward, f"{100 * free:.0f} %", f"{goals:.2f}"]
 
 
 def accelerator_table(values: Mapping[str, Any] | None) -> str:

@@ -118,6 +118,11 @@ def test_tables_of_agents_are_what_was_measured() -> None:
     collisions = first["collisions"]
     assert f"| SAC | {collisions['mean']:.2f} [{collisions['low']:.2f}, {collisions['high']:.2f}] | " in readme
     assert tables["renewed"](readme.replace("| SAC | ", "| SAC | 9")) == readme
+    rows = tables["table_of"](["rcdsac_cvar-narrow:1,0.1", "mppi-narrow"]).splitlines()[2:]
+    assert [row.split(" | ")[0] for row in rows] == [
+        *(f"| RC-DSAC (resample) CVaR β = {beta}" for beta in ("1", "0.1")),
+        "| MPPI",
+    ]
     measured = tables["accelerator_table"]({"device": "cuda", "laptop": {"plain_updates_per_second": 123.456}})
     assert measured.splitlines()[-1] == "| laptop | plain updates per second | 123.5 |"
 
