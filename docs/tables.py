@@ -1,10 +1,10 @@
 """Write the tables of README.md and the pages of docs/ anew that follow from files: ``make tables``.
 
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
-``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>`` takes these rows of
-it alone. The comment of a table of the office course
-names the folder of what ``course`` wrote, that of a table of disturbances the files of ``docs/disturbances.py``, in
-their order. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
+``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>`` takes these rows
+of it alone. The comment of a table of the office course names the folder of what ``course`` wrote, that of a table of
+disturbances the files of ``docs/disturbances.py``, in their order. The table of an accelerator is what
+``benchmarks/accelerator.py`` wrote::
 
     <!-- agents: sac-narrow pursuit-narrow -->
     | agent | collisions | ..

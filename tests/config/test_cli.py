@@ -457,7 +457,7 @@ def test_the_real_program_evaluates_as_this_process_does_and_writes_nothing_else
     assert (averse.split()[0], bolder.split()[0], written) == ("beta=-2", "beta=-1", "written to there")
     assert hit.startswith(("hit: ", "nothing was hit"))
     monkeypatch.chdir(cwd)
-    assert following == f"next: {program()} report runs=[there]"
+    assert following == f"next: {program()} report runs=there"
     assert [path.name for path in cwd.iterdir()] == ["there"]
     assert {"collisions_mean", "collisions_std"} <= set(pd.read_csv(cwd / "there" / "summary.csv"))  # all numbers
     for name in ("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json"):

@@ -81,19 +81,6 @@ def assigned(key: str, value: str) -> str:
     return f"{key}={value}" if re.fullmatch(_PLAIN, value) else quoted(key, value)
 
 
-def listed(key: str, value: str) -> str:
-    """Write an override whose value is a list of one text, as :func:`assigned` does.
-
-    Example:
-        >>> print(listed("runs", "runs/a"), listed("runs", "my runs/a"))
-        runs=[runs/a] 'runs=["my runs/a"]'
-    """
-    if re.fullmatch(_PLAIN, value):
-        return f"{key}=[{value}]"
-    escaped = value.replace('"', '\\"')
-    return shlex.quote(f'{key}=["{escaped}"]')
-
-
 def with_names(key: str, words: Sequence[str]) -> list[str]:
     """Put the key before names that stand first without it, in one list.
 

@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.baseline_name import PURSUIT
-from rcdsac_trl.config.command_line import listed
+from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.evaluation_settings import ChosenWorld, EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.run_config import read_config
@@ -103,7 +103,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
         measure=maps,
         findings=partial(barn_runs, worlds) if worlds else _findings,
         film=film if settings.record else None,
-        next_step=() if worlds else ("report", listed("runs", out.as_posix())),
+        next_step=() if worlds else ("report", assigned("runs", out.as_posix())),
     )
 
 
