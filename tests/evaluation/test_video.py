@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from rcdsac_trl.colors import LIGHT, rgb
+from rcdsac_trl.colors import LIGHT, mixed, rgb
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.evaluation.branches import predict
@@ -70,6 +70,20 @@ def test_a_large_film_becomes_a_small_gif(tmp_path: Path) -> None:
     _, gif = write_video(moving_square(1, 500, 1920), tmp_path / "film", 20.0)
     with Image.open(gif) as picture:
         assert picture.size == (960, 250)
+
+
+def test_a_gif_has_the_palette_s_colours_exactly_and_no_mesh(tmp_path: Path) -> None:
+    """Beside a picture of more colours than the format has."""
+    ramp = np.linspace(0, 255, 400).astype(np.uint8)
+    many = np.stack([np.broadcast_to(ramp, (40, 400)), np.broadcast_to(ramp[::-1], (40, 400))] * 2, axis=-1)[..., :3]
+    areas = [LIGHT.mapped, LIGHT.unmapped, LIGHT.card, LIGHT.page, mixed(LIGHT.card, LIGHT.alarm, 0.22)]
+    stripes = [np.full((10, 400, 3), rgb(color), np.uint8) for color in areas]
+    frame = np.concatenate([*stripes, many])
+    _, gif = write_video(iter([frame, frame]), tmp_path / "film", 3.0)
+    with Image.open(gif) as picture:
+        shown = np.asarray(picture.convert("RGB"))
+    assert np.array_equal(shown[:50], frame[:50])
+    assert np.abs(shown[50:].astype(int) - frame[50:]).max() < 24
 
 
 def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
