@@ -160,7 +160,8 @@ def test_ways_show_goals_and_contacts_where_they_were() -> None:
 
     free = Track("a", [at(2.5, 10.0), at(4.5, 10.0), at(6.5, 10.0)])
     hit = Track("b", [at(2.5, 10.0), at(4.5, 10.0, collisions=1), at(6.5, 10.0, 1), at(8.5, 10.0, 1, goals=1)])
-    picture = trajectories([free, hit])
+    title, picture = np.split(trajectories([free, hit], "an agent"), [42])
+    assert [(title[:, i * 420 : (i + 1) * 420] == rgb(LIGHT.ink)).all(-1).any() for i in (0, 1)] == [True, True]
     side, head = 420, 42
     assert picture.shape[1] == 2 * side
     assert side + 2 * head < picture.shape[0] < side + 5 * head  # what the colours mean stands below
@@ -171,8 +172,8 @@ def test_ways_show_goals_and_contacts_where_they_were() -> None:
 
     assert (color(0, 2.5, 10.1), color(1, 2.5, 10.1)) == (rgb(LIGHT.robot),) * 2
     assert color(0, 4.5, 10.15) == rgb(LIGHT.floor)
-    assert color(1, 4.5, 10.15) == rgb(LIGHT.touching)
-    assert color(1, 6.5, 10.15) == rgb(LIGHT.floor)  # the same contact
+    assert color(1, 4.5, 10.5) == rgb(LIGHT.touching)
+    assert color(1, 6.5, 10.5) == rgb(LIGHT.floor)  # the same contact
     assert color(0, 13.7, 8.2) == rgb(LIGHT.floor)  # not reached
     assert color(1, 13.7, 8.2) != rgb(LIGHT.floor)
     below = picture[head + side : 2 * head + side]
