@@ -21,7 +21,7 @@ from rcdsac_trl.world.render import GOAL_OPACITY
 _PANEL_INCHES = 3.6
 _HEAD_INCHES, _LEGEND_LINE_INCHES = 0.7, 0.38
 # Points; a sheet of four columns is shown at half its size.
-_FONT_SIZE, _SMALL_FONT_SIZE = 18, 15
+_FONT_SIZE, _SMALL_FONT_SIZE = 18, 13
 _MOST_COLUMNS = 4
 _TICKS = 4
 _GOAL_RADII_M = (0.42, 0.2)
