@@ -1,7 +1,7 @@
-"""How the world's speed grows with agents, workers and obstacles, and the replay's memory with steps; a figure.
+"""How the world's speed grows with agents, workers and obstacles, and the replay's memory with steps.
 
 Rates are agent steps a second: of processor time in one process, of wall time with workers; the fastest of some
-repetitions counts.
+repetitions counts. ``docs/images/scaling_figures.py`` draws ``scaling_world.png`` of it.
 """
 
 from collections.abc import Callable
@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import bench_world as bench
-from rcdsac_trl.colors import LIGHT
 
-IMAGE = Path(__file__).parents[1] / "docs" / "images" / "scaling_world.png"
+RESULT = Path(__file__).parents[1] / "results" / "scaling_world.json"
 AGENTS = (1, 2, 5, 10, 20, 40)
 WORKERS = (0, 1, 2, 5, 10)
 CLUTTER_PER_M2 = (0.0, 0.035, 0.07, 0.14, 0.28)
@@ -63,7 +62,7 @@ def scaling() -> dict[str, dict[float, float]]:
         "agents": rates(agents, bench.cpu_seconds),
         "workers": rates({n: make_env(num_workers=n) for n in WORKERS}, bench.wall_seconds),
         "clutter_per_m2": rates(clutter, bench.cpu_seconds),
-        "replay_megabytes": {float(steps): replay_bytes(steps) / 1e6 for steps in REPLAY_STEPS},
+        "replay_megabytes": {steps: replay_bytes(steps) / 1e6 for steps in REPLAY_STEPS},
     }
 
 
@@ -100,36 +99,12 @@ def replay_bytes(steps: int) -> int:
     return sum(value.untyped_storage().nbytes() for value in replay.buffer.storage._storage.values(True, True))
 
 
-def draw(curves: dict[str, dict[float, float]], path: Path) -> None:
-    """Draw one panel a curve."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    titles = {
-        "agents": ("agents in one process", "agent steps / s"),
-        "workers": (f"worker processes of {bench.NUM_AGENTS} agents, {len(bench.cores())} cores", "agent steps / s"),
-        "clutter_per_m2": ("pieces of clutter per m²", "agent steps / s"),
-        "replay_megabytes": ("agent steps in the replay", "MB"),
-    }
-    figure, axes = plt.subplots(1, 4, figsize=(15, 3.4), layout="constrained")
-    for axis, (key, (xlabel, ylabel)) in zip(axes, titles.items(), strict=True):
-        axis.plot(list(curves[key]), list(curves[key].values()), "o-", color=LIGHT.accent)
-        axis.set(xlabel=xlabel, ylabel=ylabel)
-        axis.set_ylim(bottom=0)
-        axis.grid(alpha=0.3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 def main() -> None:
-    options = bench.parser(__doc__).parse_args()
+    parser = bench.parser(__doc__)
+    parser.set_defaults(out=RESULT)
+    options = parser.parse_args()
     bench.prepare()
-    curves = scaling()
-    draw(curves, IMAGE)
-    bench.report({"cores": len(bench.cores()), **curves}, options)
+    bench.report({"cores": len(bench.cores()), "num_agents": bench.NUM_AGENTS, **scaling()}, options)
 
 
 if __name__ == "__main__":

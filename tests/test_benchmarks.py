@@ -172,18 +172,23 @@ def test_a_wrong_gradient_is_told(load: Any, monkeypatch: pytest.MonkeyPatch) ->
     assert program.largest_difference("cpu") == pytest.approx(0.01, rel=0.01)
 
 
-def test_scaling(load: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_scaling(
+    load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     learner, world = load("scaling_learner"), load("scaling_world")
-    monkeypatch.setattr(learner, "LEARNER", {"quantiles": ("fractions", [2])})
+    monkeypatch.setattr(learner, "LEARNER", {"quantiles": [2]})
     monkeypatch.setattr(learner, "TURNS", 1)
-    assert learner.learner_curves()["quantiles"][2] > 0
+    run(learner, monkeypatch, "--json", f"--out={tmp_path / 'learner.json'}")
+    assert printed(capsys)["quantiles"]["2"] > 0
     for name, values in {"AGENTS": (1,), "WORKERS": (0,), "CLUTTER_PER_M2": (0.0,), "REPLAY_STEPS": (1000,)}.items():
         monkeypatch.setattr(world, name, values)
     monkeypatch.setattr(world, "_STEPS", 1)
     monkeypatch.setattr(world, "_TURNS", 1)
-    curves = world.scaling()
+    run(world, monkeypatch, "--json", f"--out={tmp_path / 'world.json'}")
+    curves = printed(capsys)
+    assert (curves.pop("cores"), curves.pop("num_agents")) == (len(load("bench_world").cores()), 10)
     assert {name: len(curve) for name, curve in curves.items()} == dict.fromkeys(curves, 1)
-    world.draw(curves, tmp_path / "curves.png")
+    assert json.loads((tmp_path / "world.json").read_text())["agents"] == curves["agents"]
 
 
 def test_whole_job(load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,6 +28,24 @@ def test_ways_are_of_the_first_episode_in_which_the_averse_end_collides_less(mon
     assert ways.compared(collisions.iloc[:3]) == (None, 0, 1)
 
 
+def test_what_was_measured_of_scaling_is_drawn_within_its_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    scaling = program("scaling_figures", monkeypatch)
+    curve = {"1": 0.02, "8": 0.04, "32": 0.19}
+    figure = scaling.learner_figure(dict.fromkeys(scaling.LEARNER, curve))
+    for axes in figure.axes:
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+        assert axes.get_xlabel().endswith("logarithmic")
+        assert axes.lines[0].get_ydata().tolist() == pytest.approx([20.0, 40.0, 190.0])
+        assert axes.lines[1].get_ydata().tolist() == pytest.approx([190 / 32, 190 / 4, 190.0])
+    curve = {"0": 5.0, "100000": 12_000.0}
+    curves = dict.fromkeys(("agents", "workers", "clutter_per_m2", "replay_megabytes"), curve)
+    figure = scaling.world_figure({"cores": 2, "num_agents": 10, **curves})
+    for axes in figure.axes:
+        assert axes.get_ylim()[0] == 0.0
+        assert axes.get_ylim()[1] > 12_600.0
+        assert axes.xaxis.get_major_formatter()(100_000) == "100,000"
+
+
 class Staged:
     """A drive whose robots begin to touch something in given steps."""
 

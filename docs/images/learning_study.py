@@ -1,4 +1,4 @@
-"""Draw learning_study.png: training episodes of both seeds, over updates and over minutes of one idle core."""
+"""Draw learning_study.png: earlier agents' training episodes, over updates and over minutes of one idle core."""
 
 from pathlib import Path
 
@@ -25,6 +25,10 @@ for name, (seconds, folders) in RUNS.items():
     curves[name] = rows.assign(updates=UPDATES_PER_ITERATION * done, elapsed_s=seconds * done)
 figure = learning_curves(curves)
 figure.suptitle(
-    "Training episodes, with exploration, at every β; both seeds", x=0.01, ha="left", fontsize=13, color=LIGHT.ink
+    "Earlier agents, under rules 1: training episodes, with exploration, at every β; both seeds",
+    x=0.01,
+    ha="left",
+    fontsize=13,
+    color=LIGHT.ink,
 )
 figure.savefig(Path(__file__).with_suffix(".png"), dpi=130)

@@ -97,8 +97,8 @@ def main() -> None:
     spec, agent = spec_of(name)
     map_index, episode, seen = chosen(spec, agent)
     tracks = recorded(spec, agent, map_index, episode)
-    named = [Track(f"{name}  {c.heading}", track) for c, track in zip(spec.conditions, tracks, strict=True)]
-    Image.fromarray(trajectories(named)).save(Path(__file__).with_suffix(".png"), optimize=True)
+    named = [Track(c.heading, track) for c, track in zip(spec.conditions, tracks, strict=True)]
+    Image.fromarray(trajectories(named, name)).save(Path(__file__).with_suffix(".png"), optimize=True)
     print(f"{seen} Agent: `{name}`.")
 
 

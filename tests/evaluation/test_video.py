@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from rcdsac_trl.colors import LIGHT, rgb
+from rcdsac_trl.colors import LIGHT, mixed, rgb
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.evaluation.branches import predict
@@ -70,6 +70,20 @@ def test_a_large_film_becomes_a_small_gif(tmp_path: Path) -> None:
     _, gif = write_video(moving_square(1, 500, 1920), tmp_path / "film", 20.0)
     with Image.open(gif) as picture:
         assert picture.size == (960, 250)
+
+
+def test_a_gif_has_the_palette_s_colours_exactly_and_no_mesh(tmp_path: Path) -> None:
+    """Beside a picture of more colours than the format has."""
+    ramp = np.linspace(0, 255, 400).astype(np.uint8)
+    many = np.stack([np.broadcast_to(ramp, (40, 400)), np.broadcast_to(ramp[::-1], (40, 400))] * 2, axis=-1)[..., :3]
+    areas = [LIGHT.mapped, LIGHT.unmapped, LIGHT.card, LIGHT.page, mixed(LIGHT.card, LIGHT.alarm, 0.22)]
+    stripes = [np.full((10, 400, 3), rgb(color), np.uint8) for color in areas]
+    frame = np.concatenate([*stripes, many])
+    _, gif = write_video(iter([frame, frame]), tmp_path / "film", 3.0)
+    with Image.open(gif) as picture:
+        shown = np.asarray(picture.convert("RGB"))
+    assert np.array_equal(shown[:50], frame[:50])
+    assert np.abs(shown[50:].astype(int) - frame[50:]).max() < 24
 
 
 def test_a_film_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
@@ -146,7 +160,8 @@ def test_ways_show_goals_and_contacts_where_they_were() -> None:
 
     free = Track("a", [at(2.5, 10.0), at(4.5, 10.0), at(6.5, 10.0)])
     hit = Track("b", [at(2.5, 10.0), at(4.5, 10.0, collisions=1), at(6.5, 10.0, 1), at(8.5, 10.0, 1, goals=1)])
-    picture = trajectories([free, hit])
+    title, picture = np.split(trajectories([free, hit], "an agent"), [42])
+    assert [(title[:, i * 420 : (i + 1) * 420] == rgb(LIGHT.ink)).all(-1).any() for i in (0, 1)] == [True, True]
     side, head = 420, 42
     assert picture.shape[1] == 2 * side
     assert side + 2 * head < picture.shape[0] < side + 5 * head  # what the colours mean stands below
@@ -157,8 +172,8 @@ def test_ways_show_goals_and_contacts_where_they_were() -> None:
 
     assert (color(0, 2.5, 10.1), color(1, 2.5, 10.1)) == (rgb(LIGHT.robot),) * 2
     assert color(0, 4.5, 10.15) == rgb(LIGHT.floor)
-    assert color(1, 4.5, 10.15) == rgb(LIGHT.touching)
-    assert color(1, 6.5, 10.15) == rgb(LIGHT.floor)  # the same contact
+    assert color(1, 4.5, 10.5) == rgb(LIGHT.touching)
+    assert color(1, 6.5, 10.5) == rgb(LIGHT.floor)  # the same contact
     assert color(0, 13.7, 8.2) == rgb(LIGHT.floor)  # not reached
     assert color(1, 13.7, 8.2) != rgb(LIGHT.floor)
     below = picture[head + side : 2 * head + side]

@@ -16,7 +16,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import __main__ as command
 from rcdsac_trl.report import collision_report, findings, statistics, table
 from rcdsac_trl.report.evaluation_summary import summarised
-from rcdsac_trl.report.figures import collision_causes, learning_curves
+from rcdsac_trl.report.figures import beta_response, collision_causes, learning_curves, paired_differences
 from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.results import Results
@@ -348,6 +348,33 @@ def test_the_bars_add_up_to_the_collisions_of_an_episode(tmp_path: Path) -> None
     assert bars[-1].get_x() + bars[-1].get_width() == pytest.approx(3 / (MAPS * EPISODES))
     names = ["RC-DSAC (resample) pow β = -2", "RC-DSAC (resample) pow β = -1"]
     assert [text.get_text() for text in figure.axes[0].texts] == ["0.17", "0.00", *names]
+
+
+def test_differences_say_of_whom_and_which_way_they_are(tmp_path: Path) -> None:
+    agents = {"rcdsac_pow": {-2.0: 0}, "rcdsac_pow_wide": {-8.0: 1}, "mppi": {NONE: 0}, "sac": {NONE: 2}}
+    episodes = read_episodes([evaluate(tmp_path / name, name, told) for name, told in agents.items()])
+    reference = episodes.conditions["agent"].tolist().index("sac")
+    figure = paired_differences(episodes, reference, "collisions")
+    beside = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert beside == ["RC-DSAC (resample)\npow β = -2", "RC-DSAC (resample)\nwide pow β = -8", "MPPI"]
+    assert figure.axes[0].get_xlabel() == "fewer ← difference in collisions an episode → more"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a map", "mean, 95 % interval over maps"]
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_what_beta_does_is_said_in_words_on_axes_from_zero(tmp_path: Path, seeds: int) -> None:
+    told = {0.5: 0, 1.0: 1}
+    folders = [
+        evaluate(tmp_path / str(seed), "rcdsac_cvar", told, train_seed=seed, measure="cvar") for seed in range(seeds)
+    ]
+    figure = beta_response(read_episodes(folders), "cvar")
+    assert figure is not None
+    over = " (dark), and training seeds, too (pale)" if seeds > 1 else ""
+    assert figure.get_suptitle() == f"What β does, CVaR: averse at the left; 95 % intervals over maps{over}"
+    reward = figure.axes[3]
+    assert reward.get_legend() is not None
+    assert [axes.get_ylim()[0] for axes in figure.axes[:3]] == [0.0] * 3
+    assert reward.get_ylim()[0] <= 0.0
 
 
 def test_controllers_collide_under_their_names(tmp_path: Path) -> None:

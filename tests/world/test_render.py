@@ -115,8 +115,11 @@ def test_the_scale_bar_is_as_long_as_it_says(view_m: float | None, bar_m: float)
     assert scale_bar_m(shown_m) == bar_m
     assert columns[-1] - columns[0] == pytest.approx(bar_m * SIZE_PX / shown_m, abs=2)
     assert np.diff(columns).max() == 1
-    way = Renderer(SIZE_PX, view_m).draw_way(MAP, [(10.0, 8.0), (11.0, 8.0)], [], [])
-    assert np.array_equal(inked(way), columns)
+    way = [(10.0, 8.0), (11.0, 8.0)]
+    assert np.array_equal(inked(Renderer(SIZE_PX, view_m).draw_way(MAP, way, [], [])), columns)
+    beside = Renderer(SIZE_PX, view_m, scale_bar=False)
+    assert not len(inked(beside.draw(scene())))
+    assert beside.shown_m(MAP) == pytest.approx(shown_m)
 
 
 def test_the_end_of_the_ring_of_sectors_is_seen_without_a_seam() -> None:
@@ -144,6 +147,11 @@ def test_a_legend_fits_its_picture() -> None:
         assert (np.array(pixels.shape[:2]) - drawn.max(axis=0)).min() >= 2
         for name in ("robot", "trail", "wall", "mapped", "unmapped"):
             assert (np.abs(pixels - rgb(getattr(LIGHT, name))).max(-1) <= 3).any(), name
+
+
+def test_every_thing_has_a_key_of_its_own() -> None:
+    names = ("robot", "seen", "hit", "remembered", "expected", "contact", "trail", "way", "goal", "wall")
+    assert len({np.asarray(legend({name: ""}, 64, 24.0)).tobytes() for name in names}) == len(names)
 
 
 @pytest.mark.parametrize("wrong", [{"size_px": 4}, {"view_m": 0.0}, {"oversampling": 0}])

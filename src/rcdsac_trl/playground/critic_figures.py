@@ -34,7 +34,7 @@ class ReturnFigure:
             y_range=self._range,
             tools="",
             toolbar_location=None,
-            x_axis_label="fraction of what may come",
+            x_axis_label="quantile fraction τ",
             y_axis_label="return",
             title="the return it expects, worst to best",
             min_border=2,
@@ -131,7 +131,7 @@ class ValueFigure:
             source=self._chosen,
             line_width=2,
         )
-        self._bar = ColorBar(color_mapper=self._mapper, width=8, padding=4, title=None, background_fill_alpha=0.0)
+        self._bar = ColorBar(color_mapper=self._mapper, width=8, padding=4, title="value", background_fill_alpha=0.0)
         plot.add_layout(self._bar, "right")
         plot.min_border_right = _BAR_PX  # its labels change, and it is laid out once
         self._shown: ValueView | None = None
@@ -140,7 +140,13 @@ class ValueFigure:
         """Take another theme's colours."""
         restyle_plot(self.figure, colors)
         self._marks.glyph.update(fill_color=colors["arrow"], line_color=colors["alarm"])
-        self._bar.major_label_text_color = colors["faint"]
+        self._bar.update(
+            major_label_text_color=colors["faint"],
+            title_text_color=colors["faint"],
+            title_text_font_style="normal",
+            title_text_font_size="11px",
+            title_standoff=3,
+        )
 
     def copy(self, view: RobotView) -> None:
         """Show what is chosen now, and the values if there are new ones."""

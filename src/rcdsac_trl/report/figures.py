@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
@@ -18,15 +19,28 @@ from rcdsac_trl.report.findings import TAILS, bounded, labels
 from rcdsac_trl.report.read import METRIC_NAMES, Episodes
 from rcdsac_trl.report.statistics import Interval, Statistic
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, PAPER, series, style
-from rcdsac_trl.report.table import condition_label
+from rcdsac_trl.report.table import called, condition_label, setting_label
 
+_TAIL = TAILS[0]
 # What follows beta, in four panels.
 _RESPONSES: dict[str, tuple[str, Statistic]] = {
     "collisions an episode": ("collisions", statistics.mean),
     "mean speed, m/s": ("mean_speed_m_per_s", statistics.mean),
     "goals an episode": ("goals", statistics.mean),
-    f"reward: all (dashed) and the worst {TAILS[0]:.0%}": ("reward", statistics.cvar(TAILS[0])),
+    "reward an episode": ("reward", statistics.cvar(_TAIL)),
 }
+_MEASURES = {
+    "cvar": "CVaR",
+    "pow": "power law",
+    "pow_wide": "wide power law",
+    "wang": "Wang",
+    "cpw": "CPW",
+    "var": "VaR",
+}
+# Of rows that the paper's table lacks.
+_NAMES = {"rcdsac_pow_wide": ("RC-DSAC (resample)", "wide pow"), "dwa": ("DWA", ""), "mppi": ("MPPI", "")}
+# What less of a metric is called, where it is counted.
+_LESS = {"collisions": "fewer", "goals": "fewer"}
 _LEARNT = ("reward", "collisions")
 THING_COLORS = {
     "outer_wall": LIGHT.wall,
@@ -40,6 +54,8 @@ _OUTSIDE = "////"  # hatching
 PANEL = (4.6, 3.3)
 """Size of a panel in inches: its texts can be read on a telephone, and two of them stand side by side on a desk."""
 _ROW_INCHES = 0.5
+# Of differences, whose names stand in a margin of two lines beside the panel.
+_PAIR_ROW_INCHES, _MARGIN_INCHES = 0.38, 1.3
 
 
 def beta_response(episodes: Episodes, measure: str) -> Figure | None:
@@ -57,8 +73,10 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
     if not (groups := _driven_at_several(episodes, measure)):
         return None
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
+    seeds = any(_several_seeds(episodes, rows) for _, rows in groups)
     figure.suptitle(
-        f"What β does ({measure}): averse at the left; 95 % intervals over maps (and seeds, where there are several)",
+        f"What β does, {_MEASURES.get(measure, measure)}: averse at the left; "
+        f"95 % intervals over maps{' (dark), and training seeds, too (pale)' if seeds else ''}",
         x=0.01,
         ha="left",
         fontsize=13,
@@ -70,6 +88,11 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
         handles, names = axes.get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False, fontsize=9, labelcolor=INK)
     return figure
+
+
+def _several_seeds(episodes: Episodes, conditions: pd.DataFrame) -> bool:
+    """Return whether any of these conditions was driven by agents of several training seeds."""
+    return any(len(episodes.of(condition, "reward")) > 1 for _, condition in conditions.iterrows())
 
 
 @dataclass(frozen=True)
@@ -143,8 +166,19 @@ def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str
             axes.plot(rows["beta"], [statistics.mean(v) for v in values], color=color, linestyle="--", linewidth=1.2)
     style(axes, heading, "β")
     axes.set_xticks(sorted({beta for _, rows in groups for beta in rows["beta"]}))
-    if metric != "reward":
-        axes.set_ylim(0.0, 1.05 * axes.get_ylim()[1])
+    _include_zero(axes)
+    if metric == "reward":
+        lines = [
+            Line2D([], [], color=FAINT, linestyle="--", linewidth=1.2, label="mean of all"),
+            Line2D([], [], color=FAINT, linewidth=1.9, label=f"mean of the worst {100 * _TAIL:.0f} %"),
+        ]
+        axes.legend(handles=lines, loc="lower left", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
+
+
+def _include_zero(axes: Axes) -> None:
+    """Let an axis begin at 0 where all values are above it: what is small shall not look large."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(0.0 if axes.dataLim.y0 >= 0.0 else low, high + 0.05 * (high - min(low, 0.0)))
 
 
 def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figure:
@@ -155,10 +189,11 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
         reference: number of the condition that the others are compared with.
         metric: which one.
     """
-    conditions, names = episodes.conditions, labels(episodes)
+    conditions = episodes.conditions
     base = conditions.iloc[reference]
     others = [i for i in range(len(conditions)) if i != reference and conditions.iloc[i]["sensor"] == base["sensor"]]
-    figure = Figure(figsize=(PANEL[0], 1.0 + _ROW_INCHES * len(others)), layout="constrained")
+    size = (PANEL[0] + _MARGIN_INCHES, 1.7 + _PAIR_ROW_INCHES * len(others))
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     rng = np.random.default_rng(0)
     for row, i in enumerate(others):
@@ -171,10 +206,33 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
         axes.plot([found.low, found.high], [row, row], color=INK, linewidth=1.0, solid_capstyle="butt")
         axes.plot([alone.low, alone.high], [row, row], color=INK, linewidth=3.0, solid_capstyle="butt")
         axes.plot(found.value, row, "o", color=INK, markersize=6)
-    style(axes, f"{METRIC_NAMES[metric]}: difference from {names[reference]}\nmap by map (mean and 95 % interval)")
+    heading = f"{METRIC_NAMES[metric]}:\ndifference from {labels(episodes)[reference]} on the same maps"
+    style(axes, heading, f"{_LESS.get(metric, 'less')} ← difference in {METRIC_NAMES[metric]} → more")
     axes.axvline(0, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
-    _name_rows(axes, [names[i] for i in others])
+    axes.set_yticks(range(len(others)), [_beside(conditions.iloc[i]) for i in others])
+    _dress_rows(axes, len(others))
+    handles = _difference_legend(_several_seeds(episodes, conditions.iloc[[reference, *others]]))
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
     return figure
+
+
+def _beside(condition: pd.Series) -> str:
+    """Name a condition beside its row: the agent, and below it the setting, if there is one."""
+    name, measure = _NAMES.get(condition["agent"], called(condition["agent"]))
+    setting = setting_label(condition["beta"], condition["collision_weight"], condition["beta_controller"])
+    return f"{name}\n{measure}{setting}" if measure else f"{name}{setting}"
+
+
+def _difference_legend(several_seeds: bool) -> list[Line2D]:
+    """Say what dots and lines of differences are."""
+    interval = "mean, 95 % interval over maps"
+    handles = [
+        Line2D([], [], color=FAINT, marker="o", markersize=3, linestyle="", alpha=0.6, label="a map"),
+        Line2D([], [], color=INK, marker="o", markersize=6, linewidth=3.0, label=interval),
+    ]
+    if several_seeds:
+        handles.append(Line2D([], [], color=INK, linewidth=1.0, label="and over training seeds"))
+    return handles
 
 
 def _name_rows(axes: Axes, names: Sequence[str]) -> None:
@@ -182,9 +240,15 @@ def _name_rows(axes: Axes, names: Sequence[str]) -> None:
     for row, name in enumerate(names):
         axes.text(0.0, row - 0.33, name, transform=axes.get_yaxis_transform(), fontsize=9, color=INK, va="center")
     axes.set_yticks([])
+    _dress_rows(axes, len(names))
+
+
+def _dress_rows(axes: Axes, number: int) -> None:
+    """Put the first of so many rows at the top, and take away what only an axis of numbers needs."""
     axes.spines["left"].set_visible(False)
+    axes.tick_params(axis="y", length=0)
     axes.grid(visible=False, axis="y")
-    axes.set_ylim(len(names) - 0.6, -0.6)
+    axes.set_ylim(number - 0.4, -0.6)
 
 
 def collision_causes(summary: pd.DataFrame) -> Figure:
@@ -267,8 +331,7 @@ def _draw_learning(axes: Axes, runs: Mapping[str, pd.DataFrame], metric: str, cl
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
-    if metric == "collisions":
-        axes.set_ylim(bottom=0)
+    _include_zero(axes)
 
 
 def _shade(axes: Axes, x: pd.Series, intervals: Sequence[Interval], color: str, alpha: float) -> None:

@@ -87,11 +87,21 @@ def condition_label(
     agent: str, sensor: str, beta: float, weight: float, controller: str | None, sensors: int = 1
 ) -> str:
     """Name a condition in figures and lists; the sensor only where there are several."""
-    if isinstance(controller, str):
-        told = f" β by {controller.replace('_', ' ')}"
-    else:
-        told = f" β = {beta:g}" if pd.notna(beta) else f" w_coll = {weight:g}" if pd.notna(weight) else ""
+    told = setting_label(beta, weight, controller)
     return f"{row_label(agent)}{told}{', ' + sensor if sensors > 1 else ''}"
+
+
+def setting_label(beta: float, weight: float, controller: str | None) -> str:
+    """Name the setting that an agent is driven at, as it stands behind the agent's name.
+
+    Example:
+        >>> nothing = float("nan")
+        >>> setting_label(-1.0, nothing, None), setting_label(nothing, nothing, "goal_distance")
+        (' β = -1', ' β by goal distance')
+    """
+    if isinstance(controller, str):
+        return f" β by {controller.replace('_', ' ')}"
+    return f" β = {beta:g}" if pd.notna(beta) else f" w_coll = {weight:g}" if pd.notna(weight) else ""
 
 
 def row_label(agent: str) -> str:

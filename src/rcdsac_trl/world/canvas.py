@@ -32,6 +32,35 @@ def font(size: float) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)
 
 
+def draw_scale_bar(
+    draw: ImageDraw.ImageDraw, corner: tuple[float, float], length_m: float, scale: float, size: float, behind: str
+) -> None:
+    """Draw a scale bar with its length above it, and a margin around both.
+
+    Args:
+        draw: of the picture.
+        corner: its lower right, px.
+        length_m: how long it is.
+        scale: pixels a metre.
+        size: of its letters, px.
+        behind: colour of the margin.
+    """
+    right, line = corner
+    thick = max(1, round(size / 5))
+    left, halo = right - length_m * scale, thick
+    draw.rectangle((left - halo, line - thick - halo, right + halo, line + halo), behind)
+    draw.rectangle((left, line - thick, right, line), LIGHT.ink)
+    draw.text(
+        ((left + right) / 2, line - 2 * thick),
+        f"{length_m:g} m",
+        LIGHT.ink,
+        font=font(size),
+        anchor="md",
+        stroke_width=2 * halo,
+        stroke_fill=behind,
+    )
+
+
 class Canvas:
     """Draws in metres of the map frame onto an image.
 
@@ -89,18 +118,6 @@ class Canvas:
 
     def scale_bar(self) -> None:
         """Draw a scale bar at the lower right, with a margin of floor around it, as it may lie on anything."""
-        length_m, size = scale_bar_m(self.image.width / self._scale), self.image.width / _BAR_FONT_SHARE
-        pad, thick = size, max(1, round(size / 5))
-        right, line = self.image.width - pad, self.image.height - pad
-        left, halo = right - length_m * self._scale, thick
-        self._draw.rectangle((left - halo, line - thick - halo, right + halo, line + halo), LIGHT.floor)
-        self._draw.rectangle((left, line - thick, right, line), LIGHT.ink)
-        self._draw.text(
-            ((left + right) / 2, line - 2 * thick),
-            f"{length_m:g} m",
-            LIGHT.ink,
-            font=font(size),
-            anchor="md",
-            stroke_width=2 * halo,
-            stroke_fill=LIGHT.floor,
-        )
+        length_m, pad = scale_bar_m(self.image.width / self._scale), self.image.width / _BAR_FONT_SHARE
+        corner = (self.image.width - pad, self.image.height - pad)
+        draw_scale_bar(self._draw, corner, length_m, self._scale, pad, LIGHT.floor)

@@ -22,6 +22,8 @@ SEEN_OPACITY = 0.2
 """Of what the sensor sees: the floor and what stands there show through."""
 GOAL_OPACITY = 0.24
 """Of the inside of a goal's ring."""
+# Around a map that is shown as a whole, as a share of its side.
+_MARGIN = 0.02
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class Renderer:
         size_px: width and height of a frame.
         view_m: side of the square around the robot that is shown; None shows the whole map.
         oversampling: how many times finer than the frame everything is drawn.
+        scale_bar: whether one lies on the map, at the lower right; else it belongs beside the picture.
 
     Example:
         >>> from rcdsac_trl.world.task.env import NavigationEnv
@@ -71,7 +74,9 @@ class Renderer:
         (256, 256, 3)
     """
 
-    def __init__(self, size_px: int = 512, view_m: float | None = None, oversampling: int = 2) -> None:
+    def __init__(
+        self, size_px: int = 512, view_m: float | None = None, oversampling: int = 2, scale_bar: bool = True
+    ) -> None:
         if size_px < 16 or oversampling < 1 or (view_m is not None and view_m <= 0):
             raise UserInputError(
                 f"size_px={size_px}, view_m={view_m}, oversampling={oversampling} cannot be drawn; give at "
@@ -80,6 +85,7 @@ class Renderer:
         self._size_px = size_px
         self._view_m = view_m
         self._fine = oversampling
+        self._scale_bar = scale_bar
         self._font = font(size_px / 32 * oversampling)
         self._background: tuple[Map, Image.Image] | None = None
 
@@ -88,7 +94,7 @@ class Renderer:
 
         Args:
             scene: what to draw.
-            caption: a line of text at the upper left; the scale bar is at the lower right.
+            caption: a line of text at the upper left.
 
         Returns:
             uint8 RGB, shape [size_px, size_px, 3].
@@ -104,7 +110,8 @@ class Renderer:
         for x, y, radius in scene.expected:
             canvas.disc(x, y, radius, None, LIGHT.remembered, 0.05)
         _draw_robot(canvas, scene)
-        canvas.scale_bar()
+        if self._scale_bar:
+            canvas.scale_bar()
         if caption:
             self._write(canvas.image, caption)
         return np.asarray(canvas.image.reduce(self._fine))
@@ -135,14 +142,20 @@ class Renderer:
         x, y = way[0]
         canvas.disc(x, y, 0.2, LIGHT.robot, LIGHT.robot_edge, 0.06)
         for x, y in touches:
-            canvas.disc(x, y, 0.26, LIGHT.touching, LIGHT.card, 0.05)
-        canvas.scale_bar()
+            # A ring, so that a goal's number inside stays legible.
+            canvas.disc(x, y, 0.56, None, LIGHT.touching, 0.16)
+        if self._scale_bar:
+            canvas.scale_bar()
         return np.asarray(canvas.image.reduce(self._fine))
 
+    def shown_m(self, map_: Map) -> float:
+        """Return the side of what a frame shows of a map."""
+        return self._view_m or (1.0 + 2.0 * _MARGIN) * map_.size_m
+
     def _canvas(self, map_: Map, centre: Sequence[float]) -> Canvas:
-        margin = 0.02 * map_.size_m
+        margin = _MARGIN * map_.size_m
         whole = map_.size_m + 2 * margin
-        view = self._view_m or whole
+        view = self.shown_m(map_)
         side = self._size_px * self._fine
         scale = side / view
         if self._background is None or self._background[0] is not map_:

@@ -7,13 +7,16 @@ import itertools
 import os
 import subprocess
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from subprocess import PIPE
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial import cKDTree
 
+from rcdsac_trl.colors import LIGHT, rgb
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.storage import atomic
 
@@ -21,10 +24,12 @@ Frame = NDArray[np.uint8]
 
 # Constant quality of x264: lines and text stay sharp, and flat colours cost little.
 _QUALITY = "26"
-# A GIF stores every change of a pixel: fewer frames and pixels and few colours keep it to a few MB.
+# A GIF stores every change of a pixel: fewer frames and pixels keep it to a few MB.
 _GIF_FPS = 3.0
 _GIF_WIDTH_PX = 960
-_GIF_COLORS = 128
+# As many as the format has. Of these, so many are what most pixels of the frames are, exactly: a mean of two areas'
+# colours would be neither's, and what is translucent would get a mesh where it crosses a grid.
+_GIF_COLORS, _FREQUENT_COLORS = 256, 64
 # Frames that the GIF's colours are taken from.
 _PALETTE_FRAMES = 12
 
@@ -133,11 +138,47 @@ def _gif(packed: Sequence[bytes], period_s: float) -> bytes:
     mosaic = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
     for number, sample in enumerate(samples):
         mosaic.paste(sample, (0, number * sample.height))
-    palette = mosaic.quantize(_GIF_COLORS, Image.Quantize.MAXCOVERAGE)
-    first, *others = (_image(data).quantize(palette=palette, dither=Image.Dither.NONE) for data in packed)
+    colors = _gif_colors(mosaic)
+    first, *others = (_in_colors(_image(data), colors) for data in packed)
     out = io.BytesIO()
     first.save(out, "gif", save_all=True, append_images=others, duration=round(1000 * period_s), loop=0, optimize=False)
     return out.getvalue()
+
+
+def _gif_colors(frames: Image.Image) -> NDArray[np.uint8]:
+    """Return the GIF's colours, [256, 3]: the palette's of all pictures, frequent ones, and what covers the rest.
+
+    Args:
+        frames: RGB; some of those that will be shown, in one picture.
+    """
+    found, counts = np.unique(_packed(frames), return_counts=True)
+    frequent = _unpacked(found[np.argsort(counts)[::-1][:_FREQUENT_COLORS]])
+    exact = np.unique(np.concatenate([np.array([*map(rgb, astuple(LIGHT))], np.uint8), frequent]), axis=0)
+    covering = frames.quantize(_GIF_COLORS - len(exact), Image.Quantize.MAXCOVERAGE).getpalette() or []
+    colors = np.zeros((_GIF_COLORS, 3), np.uint8)
+    given = np.concatenate([exact, np.array(covering, np.uint8).reshape(-1, 3)])
+    colors[: len(given)] = given
+    return colors
+
+
+def _in_colors(image: Image.Image, colors: NDArray[np.uint8]) -> Image.Image:
+    """Return a picture with a palette, each pixel in the nearest colour; Pillow takes one that is near alone."""
+    found, places = np.unique(_packed(image), return_inverse=True)
+    _, nearest = cKDTree(colors).query(_unpacked(found))
+    shown = Image.fromarray(nearest[places].astype(np.uint8).reshape(image.height, image.width))
+    shown.putpalette(colors.tobytes())
+    return shown
+
+
+def _packed(image: Image.Image) -> NDArray[np.uint32]:
+    """Return an RGB picture's pixels as one number each."""
+    red, green, blue = np.asarray(image, np.uint32).reshape(-1, 3).T
+    return red << 16 | green << 8 | blue
+
+
+def _unpacked(packed: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Return red, green and blue of such numbers, [n, 3]."""
+    return np.stack([packed >> 16, packed >> 8 & 255, packed & 255], axis=-1).astype(np.uint8)
 
 
 def _image(data: bytes) -> Image.Image:

@@ -19,9 +19,9 @@ from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.render import GOAL_OPACITY
 
 _PANEL_INCHES = 3.6
-_HEAD_INCHES, _LEGEND_LINE_INCHES = 0.55, 0.28
+_HEAD_INCHES, _LEGEND_LINE_INCHES = 0.7, 0.38
 # Points; a sheet of four columns is shown at half its size.
-_FONT_SIZE, _SMALL_FONT_SIZE = 13, 10
+_FONT_SIZE, _SMALL_FONT_SIZE = 18, 13
 _MOST_COLUMNS = 4
 _TICKS = 4
 _GOAL_RADII_M = (0.42, 0.2)
@@ -123,6 +123,7 @@ def _legend() -> list[Patch | Line2D]:
         dot("mover", CAPTIONS["mover"]),
         dot("robot", "start"),
         dot("goal", "goal", GOAL_OPACITY),
-        Line2D([], [], color=LIGHT.way, linewidth=1.8, marker="o", markersize=5, label="way by what is known"),
+        dot("way", "waypoint"),
+        Line2D([], [], color=LIGHT.way, linewidth=1.8, label="way by what is known"),
         Line2D([], [], color=LIGHT.ink, linewidth=1.8, linestyle=_DOTS, label="true shortest way"),
     ]
