@@ -173,7 +173,7 @@ def _in_colors(image: Image.Image, colors: NDArray[np.uint8]) -> Image.Image:
 def _packed(image: Image.Image) -> NDArray[np.uint32]:
     """Return an RGB picture's pixels as one number each."""
     red, green, blue = np.asarray(image, np.uint32).reshape(-1, 3).T
-    return red << 16 | green << 8 | blue
+    return np.asarray(red << 16 | green << 8 | blue, np.uint32)
 
 
 def _unpacked(packed: NDArray[np.uint32]) -> NDArray[np.uint8]:
