@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcdsac_trl.config import gymnasium_id
+from rcdsac_trl.errors import UserInputError
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy import Policy
@@ -56,6 +57,10 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
     # Imported late, so that importing the package stays instant.
     from rcdsac_trl.deploy import Policy, find_weights, read_weights
 
+    if not isinstance(name_or_folder, str | Path):
+        raise UserInputError(
+            f"an agent is no {type(name_or_folder).__name__}: give its name, such as 'rcdsac_pow-narrow', or a folder"
+        )
     if (Path(name_or_folder) / "checkpoints").is_dir():
         from rcdsac_trl.release.named_agent import named_agent
 

@@ -87,12 +87,32 @@ def test_what_is_missing_is_named_with_the_nearest_or_the_way_to_it(own: Path) -
     written(own / "rcdsac_pow-narrow")  # of two that are as near the one that is there
     with pytest.raises(UserInputError, match=r"^there is no agent 'rcdsac_pow': did you mean rcdsac_pow-narrow\?"):
         find_weights("rcdsac_pow")
+    for name in ("sac-sparse", "sac-narrow", "rcdsac_pow-sparse", "rcdsac_pow_wide-narrow"):
+        written(own / name)
+    for typed, meant in {
+        "rcdsac_pow": "rcdsac_pow-narrow",
+        "sac": "sac-narrow",
+        "rcdsac_cv": "rcdsac_cvar-narrow",
+    }.items():
+        with pytest.raises(UserInputError, match=rf"^there is no agent '{typed}': did you mean {meant}\?"):
+            find_weights(typed)
+    # Who takes no run folder offers none.
+    with pytest.raises(UserInputError, match=r"^there is no agent 'quick': .*; or name a folder that `export` wrote$"):
+        find_weights("quick", takes_runs=False)
+    with pytest.raises(UserInputError, match=r"own holds no config\.json: .*; or name a folder that `export` wrote$"):
+        find_weights(own, takes_runs=False)
     with pytest.raises(UserInputError) as raised:
         find_weights("dsac_pow_-2-sparse")
     assert f"agent dsac_pow_-2-sparse is not here (looked into {own})" in str(raised.value)
     assert "let RCDSAC_TRL_WEIGHTS name the folder weights/ of a checkout" in str(raised.value)
     trained = "-m +experiment=table preset=laptop sensor=sparse seed=0 experiment.only=[dsac_pow_-2]"
     assert str(raised.value).endswith(f"or train it, python -m rcdsac_trl.train {trained}")
+
+
+@pytest.mark.parametrize(("given", "kind"), [(None, "NoneType"), (3, "int"), (["sac-narrow"], "list")])
+def test_what_names_nothing_is_no_agent(given: object, kind: str) -> None:
+    with pytest.raises(UserInputError, match=f"^an agent is no {kind}: give its name, such as 'rcdsac_pow-narrow', or"):
+        rcdsac_trl.load(given)  # type: ignore[arg-type]
 
 
 def test_the_table_and_the_wheel_have_the_agents_that_are_named() -> None:
