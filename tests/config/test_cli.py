@@ -293,6 +293,7 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         ([RUN, "beta=[-1]", "device=tpu"], "device=tpu is not supported"),
         ([RUN, "beta=[-1]", "map=moon"], "map=moon does not exist: choose one of "),
         ([RUN, "beta=[-1]", "task.episode_step=3"], "there is no key task.episode_step: did you mean task.episode_st"),
+        ([RUN, "beta=[-1]", "task.episode_steps=0"], "task.episode_steps=0 must be at least 1"),
         ([RUN, "beta=[-1]", "task.episode_steps=few"], "task.episode_steps=few must be a whole number"),
         ([RUN, "beta=[-1]", "map.num_movers=-1"], "num_movers is -1 but must be"),
         ([RUN, "beta=[-1]", "+sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),

@@ -113,6 +113,27 @@ def test_a_value_that_a_shell_split_at_its_space_is_put_together() -> None:
     assert refusal("evaluate", "run", "=", "x").endswith("write it as <key>=<value>, without spaces around =")
 
 
+@pytest.mark.parametrize(
+    ("config_name", "words", "told"),
+    [
+        ("evaluate", ["rcdsac_pow-narrow"], "rcdsac_pow-narrow cannot be read: did you mean run=rcdsac_pow-narrow?"),
+        ("report", ["sac-narrow"], "sac-narrow cannot be read: did you mean runs=[sac-narrow]?"),
+        ("train", ["rcdsac_pow"], "rcdsac_pow cannot be read: did you mean +algo=rcdsac_pow?"),
+        ("train", [POW, "sparse"], "sparse cannot be read: did you mean sensor=sparse?"),
+        ("train", ["default"], "default cannot be read: write it as <key>=<value>"),  # of several groups
+        ("evaluate", ["--num_maps", "3"], "there is no option --num_maps: did you mean num_maps=3?"),
+        ("evaluate", ["run=x", "--num_maps=3"], "there is no option --num_maps: did you mean num_maps=3?"),
+        (
+            "evaluate",
+            ["--record", "run=x"],
+            "there is no option --record: --help lists them; a key takes no dashes, record=<value>",
+        ),
+    ],
+)
+def test_a_value_without_its_key_is_answered_by_both(config_name: str, words: list[str], told: str) -> None:
+    assert refusal(config_name, *words) == told
+
+
 def test_several_values_are_jobs_for_train_alone() -> None:
     assert ", or add -m to run one job for each, or" in refusal("train", POW, "seed=0,1")
     assert "-m" not in refusal("evaluate", "seed=0,1")

@@ -16,7 +16,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.config.command_line import key_of, several, unreadable
+from rcdsac_trl.config.command_line import assigned, key_of, listed, several, unreadable
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.typed import unknown_key
 from rcdsac_trl.errors import UserInputError, first_line
@@ -162,7 +162,8 @@ def choices(group: str) -> list[str]:
 def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     text = str(error)
     if isinstance(error, OverrideParseException):
-        return unreadable(error.override or "", overrides)
+        word = error.override or ""
+        return unreadable(word, overrides, _meant(word, config_name) if config_name else None)
     if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']*)'", text):
         group, name = match.groups()
         known = choices(group)
@@ -180,6 +181,21 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     if match := re.match(r"Could not override '([^']+)'", text):
         return _no_key(match[1], config_name, overrides)
     return " ".join(text.split())
+
+
+def _meant(word: str, config_name: str) -> str | None:
+    """Return the override of which a word is the value: a choice of one group alone, or an agent."""
+    groups = [group for group in root_groups(config_name) if word in choices(group)]
+    if len(groups) == 1:
+        return f"{'+' if groups[0] == 'algo' else ''}{groups[0]}={word}"
+    from rcdsac_trl.deploy.policy.registry import shipped_names  # late: whoever mistypes nothing does not wait for it
+
+    keys = OmegaConf.load(CONF_DIR / f"{config_name}.yaml")
+    if word not in shipped_names():
+        return None
+    if "run" in keys:
+        return assigned("run", word)
+    return listed("runs", word) if "runs" in keys else None
 
 
 def _no_key(key: str, config_name: str, overrides: list[str]) -> str:
