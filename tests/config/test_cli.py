@@ -81,6 +81,11 @@ def refusal(
         ([POW, "algo/distortion=mean"], "algo/distortion=mean does not exist: choose one of cpw, cvar, "),
         ([POW, "map=null"], "map=null chooses nothing: choose one of "),
         ([POW, "+map=easy"], "map is chosen twice: write map=<name> once, without a plus"),
+        ([POW, "+preset=laptop"], "preset is chosen twice: write preset=<name> once, without a plus"),
+        (
+            ["hydra.searchpath=[robotz]", "robot=cart"],
+            "hydra.searchpath=[robotz]: robotz is no folder: name those that",
+        ),
         ([POW, "sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
         # misspelt, unknown and missing keys
         ([POW, "learner.batchsize=3"], "there is no key learner.batchsize: did you mean learner.batch_size?"),
@@ -148,6 +153,10 @@ def refusal(
         ([POW, "logger.backends=csv"], "logger.backends=csv must be a list of words in brackets"),
         # what does not go together
         ([POW, "sensor.memory_s=0"], "network.look_ahead=true reads what is remembered: set sensor.memory_s above 0"),
+        (
+            [POW, "init=rcdsac_pow-narrow", "sensor=sparse", "preset=smoke"],
+            "above 0, or leave sensor out, which init=rcdsac_pow-narrow brings along",
+        ),
         (
             [POW, "collector=parallel_env", "world.num_agents=10", "world.num_workers=3"],
             "num_workers=3 cannot share 10 agents evenly",

@@ -100,12 +100,23 @@ def _compose(config_name: str, overrides: list[str], *, return_hydra_config: boo
     for override in overrides:
         if not key_of(override).partition("@")[0].strip():  # Hydra fails an assertion
             raise UserInputError(f"{override} names no key: write it as <key>=<value>, without spaces around =")
+        if key_of(override) == "hydra.searchpath":
+            _check_searchpath(override)
     overrides = with_sections(config_name, overrides)
     with _initialized():
         try:
             return hydra.compose(config_name, overrides=overrides, return_hydra_config=return_hydra_config)
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise UserInputError(_sentence(error, config_name, overrides)) from error
+
+
+def _check_searchpath(override: str) -> None:
+    """Refuse what is no folder: Hydra would only warn, and then miss what it is to find there."""
+    named = parse([override])[0].value()
+    for place in named if isinstance(named, list) else [named]:
+        path = str(place).removeprefix("file://")
+        if "://" not in path and not os.path.isdir(path):
+            raise UserInputError(f"{override}: {path} is no folder: name those that hold configs of yours")
 
 
 def _initialized() -> AbstractContextManager[None]:
@@ -176,8 +187,9 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
         return f"write +algo=<name> (with a plus): one of {', '.join(choices('algo'))}"
     if match := re.match(r"Ambiguous value for argument '([^']+)'", text):
         return several(match[1], as_jobs=config_name == "train")
-    if match := re.match(r"Multiple values for (\S+)\.", text):
-        return f"{match[1]} is chosen twice: write {match[1]}=<name> once, without a plus"
+    if match := re.match(r"Multiple values for (\S+)\.|(\S+) appears more than once in the final defaults list", text):
+        group = match[1] or match[2]
+        return f"{group} is chosen twice: write {group}=<name> once, without a plus"
     if match := re.match(r"Could not override '([^']+)'", text):
         return _no_key(match[1], config_name, overrides)
     return " ".join(text.split())
