@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from rcdsac_trl.config.compose import all_keys, choices, root_groups
+from rcdsac_trl.config.compose import all_keys, offered, root_groups
 from rcdsac_trl.config.verbs import VERBS
 
 _SCRIPT = """\
@@ -41,7 +41,7 @@ def _words(verb: str) -> Iterator[str]:
     for root in groups:
         for group in root_groups(root):
             plus = "+" if group == "algo" else ""
-            yield from (f"{plus}{group}={option}" for option in choices(group))
+            yield from (f"{plus}{group}={option}" for option in offered(root, group))
     keys = all_keys(verb)
     sections = {key.rpartition(".")[0] for key in keys}
     yield from (f"{key}=" for key in keys if key not in sections)

@@ -170,6 +170,12 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF_DIR / group).glob("*.yaml"))
 
 
+def offered(config_name: str, group: str) -> list[str]:
+    """List the options of a group that a root can work with: nothing trains on the test that ``map=barn`` is."""
+    trains = config_name in ("train", "search", "sweep")
+    return [option for option in choices(group) if not (trains and (group, option) == ("map", "barn"))]
+
+
 def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     text = str(error)
     if isinstance(error, OverrideParseException):
@@ -177,12 +183,12 @@ def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
         return unreadable(word, overrides, _meant(word, config_name) if config_name else None)
     if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']*)'", text):
         group, name = match.groups()
-        known = choices(group)
+        known = offered(config_name, group)
         return f"{group}={name} does not exist: " + (f"choose one of {', '.join(known)}" if known else "leave it out")
     for override in overrides:
         group, _, name = override.lstrip("+").partition("=")
         if name == "null" and choices(group):
-            return f"{group}=null chooses nothing: choose one of {', '.join(choices(group))}"
+            return f"{group}=null chooses nothing: choose one of {', '.join(offered(config_name, group))}"
     if config_name == "train" and any(override.startswith("algo=") for override in overrides):
         return f"write +algo=<name> (with a plus): one of {', '.join(choices('algo'))}"
     if match := re.match(r"Ambiguous value for argument '([^']+)'", text):
