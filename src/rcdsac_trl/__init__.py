@@ -51,16 +51,26 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
         options: keywords of :class:`rcdsac_trl.deploy.Policy`.
 
     Raises:
-        rcdsac_trl.errors.UserInputError: if there is no such agent, or it cannot be read.
+        rcdsac_trl.errors.UserInputError: if there is no such agent, it cannot be read, or a package is missing for it.
     """
     _register_beside_gymnasium()
-    # Imported late, so that importing the package stays instant.
-    from rcdsac_trl.deploy import Policy, find_weights, read_weights
-
     if not isinstance(name_or_folder, str | Path):
         raise UserInputError(
             f"an agent is no {type(name_or_folder).__name__}: give its name, such as 'rcdsac_pow-narrow', or a folder"
         )
+    try:
+        return _loaded(name_or_folder, options)
+    except ModuleNotFoundError as error:  # of a robot that has the package without all that it trains with
+        raise UserInputError(
+            f"{error.name} is not installed: shipped and exported agents need `pip install numpy safetensors numba`, a "
+            "run folder all that rcdsac-trl depends on"
+        ) from error
+
+
+def _loaded(name_or_folder: str | Path, options: dict[str, Any]) -> "Policy":
+    # Imported late, so that importing the package stays instant.
+    from rcdsac_trl.deploy import Policy, find_weights, read_weights
+
     if (Path(name_or_folder) / "checkpoints").is_dir():
         from rcdsac_trl.release.named_agent import named_agent
 

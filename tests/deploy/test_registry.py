@@ -1,5 +1,7 @@
 """Agents by name: where they are looked for, which comes first, and what is said where one is missing."""
 
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -113,6 +115,16 @@ def test_what_is_missing_is_named_with_the_nearest_or_the_way_to_it(own: Path) -
 def test_what_names_nothing_is_no_agent(given: object, kind: str) -> None:
     with pytest.raises(UserInputError, match=f"^an agent is no {kind}: give its name, such as 'rcdsac_pow-narrow', or"):
         rcdsac_trl.load(given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("package", ["safetensors", "numba"])
+def test_a_package_that_a_robot_lacks_is_named_with_how_to_get_it(package: str) -> None:
+    code = f"import sys; sys.modules[{package!r}] = None; import rcdsac_trl; rcdsac_trl.load('rcdsac_pow-narrow')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1] == (
+        f"rcdsac_trl.errors.UserInputError: {package} is not installed: shipped and exported agents need `pip install "
+        "numpy safetensors numba`, a run folder all that rcdsac-trl depends on"
+    )
 
 
 def test_the_table_and_the_wheel_have_the_agents_that_are_named() -> None:
