@@ -83,6 +83,8 @@ def test_nothing_is_silent_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "print", note, raising=False)
     with never_silent(silence_s=0.001):
         assert enough.wait(timeout=60)
+        assert told[0].endswith(" s: it imports and reads, and the first call after an installation compiles")
+        assert told[1].endswith(" s")  # said once
         enough.clear()
         told.clear()
         with Work("two maps", 2, "map") as work:

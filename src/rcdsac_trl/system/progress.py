@@ -20,6 +20,9 @@ _FORETOLD_S = 3.0
 _MEASURED_SHARE = 0.01
 _FORETOLD_SHARE = 0.05
 
+# What a program does while it has no work to tell of.
+_BEFORE_WORK = ": it imports and reads, and the first call after an installation compiles"
+
 Watch = Callable[[int], None]
 """Is told, again and again, how many steps are done so far."""
 Part = TypeVar("Part")
@@ -132,12 +135,14 @@ def never_silent(silence_s: float = SILENCE_S) -> Iterator[None]:
     began_s = time.monotonic()
 
     def tell() -> None:
+        what = _BEFORE_WORK
         while not over.wait(silence_s):
             how_long = f"at work for {duration(time.monotonic() - began_s)}"
             if _under_way:
                 _under_way[-1].tell(how_long)
             else:
-                print(f"rcdsac_trl: {how_long}", file=sys.stderr)
+                print(f"rcdsac_trl: {how_long}{what}", file=sys.stderr)
+                what = ""  # said once
 
     teller = threading.Thread(target=tell, daemon=True)
     teller.start()
