@@ -200,7 +200,9 @@ def test_hydras_own_help_is_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytest
 @pytest.fixture(scope="module")
 def completed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[str]]:
     """Complete a line as bash does."""
-    script = tmp_path_factory.mktemp("completion") / "rcdsac-trl"
+    folder = tmp_path_factory.mktemp("completion")
+    (folder / "runs").mkdir()
+    script = folder / "rcdsac-trl"
     script.write_text(bash_completion())
     code = (
         f'source {script}; COMP_LINE=$1; COMP_POINT=${{#1}}; read -ra COMP_WORDS <<<"$1"; '
@@ -208,7 +210,9 @@ def completed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[
     )
 
     def complete(line: str) -> list[str]:
-        done = subprocess.run(["bash", "-c", code, "bash", line], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["bash", "-c", code, "bash", line], cwd=folder, capture_output=True, text=True, check=True
+        )
         assert done.stderr == ""
         return done.stdout.splitlines()
 
@@ -227,7 +231,10 @@ def completed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[
         ("rcdsac-trl train map=b", [""]),  # which nothing trains on
         ("rcdsac-trl search map=b", [""]),
         ("rcdsac-trl train seed=1 learner.ga", ["learner.gamma="]),
-        ("rcdsac-trl evaluate run=ru", [""]),  # left to bash, which knows files
+        ("rcdsac-trl evaluate run=rcdsac_pow-n", ["rcdsac_pow-narrow "]),
+        ("rcdsac-trl train init=sac-n", ["sac-narrow "]),
+        ("rcdsac-trl evaluate run=ru", ["runs/"]),
+        ("rcdsac-trl evaluate out=ru", [""]),  # left to bash, which knows files
         ("rcdsac-trl nothing x", [""]),
     ],
 )
