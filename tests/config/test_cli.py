@@ -305,7 +305,7 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         ([RUN, "beta=[-1]", "task.episode_steps=0"], "task.episode_steps=0 must be at least 1"),
         ([RUN, "beta=[-1]", "task.episode_steps=few"], "task.episode_steps=few must be a whole number"),
         ([RUN, "beta=[-1]", "map.num_movers=-1"], "num_movers is -1 but must be"),
-        ([RUN, "beta=[-1]", "+sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
+        (["baseline=pursuit", "+sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
         (["baseline=pursuit", "sensor.max_range_m=10"], "there is no key sensor.max_range_m: sensor has name"),
         (["baseline=pursuit", "algo.beta=-1"], "there is no key algo.beta"),
         (
