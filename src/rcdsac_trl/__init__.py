@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcdsac_trl.config.gymnasium_id import register_with_gymnasium
+from rcdsac_trl.errors import UserInputError
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy import Policy
@@ -49,8 +50,22 @@ def load(name_or_folder: str | Path, **options: Any) -> "Policy":
         options: keywords of :class:`rcdsac_trl.deploy.Policy`.
 
     Raises:
-        rcdsac_trl.errors.UserInputError: if there is no such agent, or it cannot be read.
+        rcdsac_trl.errors.UserInputError: if there is no such agent, it cannot be read, or a package is missing for it.
     """
+    if not isinstance(name_or_folder, str | Path):
+        raise UserInputError(
+            f"an agent is no {type(name_or_folder).__name__}: give its name, such as 'rcdsac_pow-narrow', or a folder"
+        )
+    try:
+        return _loaded(name_or_folder, options)
+    except ModuleNotFoundError as error:  # of a robot that has the package without all that it trains with
+        raise UserInputError(
+            f"{error.name} is not installed: shipped and exported agents need `pip install numpy safetensors numba`, a "
+            "run folder all that rcdsac-trl depends on"
+        ) from error
+
+
+def _loaded(name_or_folder: str | Path, options: dict[str, Any]) -> "Policy":
     # Imported late, so that importing the package stays instant.
     from rcdsac_trl.deploy import Policy, find_weights, read_weights
 

@@ -9,10 +9,12 @@ from rcdsac_trl.config.completion import bash_completion
 from rcdsac_trl.config.verb_help import list_of_verbs
 from rcdsac_trl.config.verbs import module_of, verb_named
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.system.runtime import speak_anywhere
 
 
 def main() -> None:
     """Do what the first word says; without one, list what there is."""
+    speak_anywhere()
     first, *arguments = sys.argv[1:] or ["--help"]
     try:
         if first in ("--help", "-h", "help"):

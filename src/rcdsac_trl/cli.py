@@ -14,7 +14,7 @@ import hydra
 from hydra._internal.utils import get_args_parser
 from omegaconf import DictConfig
 
-from rcdsac_trl.config.command_line import expanded, key_of
+from rcdsac_trl.config.command_line import expanded, key_of, no_option
 from rcdsac_trl.config.compose import combinations, compose, output_folder, with_sections
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.verb_help import verb_help
@@ -212,7 +212,7 @@ def read_arguments(argv: list[str]) -> Namespace | None:
     """
     args, unknown = _parsed(argv)
     if unknown:
-        raise UserInputError(f"there is no option {unknown[0]}: --help lists them; put a value with spaces in quotes")
+        raise UserInputError(no_option(unknown[0], argv))
     for option in ("config_path", "config_name", "config_dir"):
         if getattr(args, option) is not None:
             raise UserInputError(f"--{option.replace('_', '-')} cannot be used: choose with overrides, <key>=<value>")

@@ -16,7 +16,6 @@ from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.progress import Work, counted
 from rcdsac_trl.system.resources import check_picture, check_writable
-from rcdsac_trl.world.maps.contact_sheet import contact_sheet
 from rcdsac_trl.world.maps.files.barn import BarnMapSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings, described
 from rcdsac_trl.world.maps.files.map_files import map_files
@@ -52,6 +51,8 @@ class Sheet:
 
     def run(self) -> None:
         """Write the picture, and the maps where that is wanted."""
+        from rcdsac_trl.world.maps.contact_sheet import contact_sheet  # late: a mistake does not wait for Matplotlib
+
         source = self.map.files() if isinstance(self.map, BarnMapSettings) else self.map
         if isinstance(source, FileMapSettings):
             for file in map_files(source.path)[: self.count]:

@@ -81,6 +81,11 @@ def refusal(
         ([POW, "algo/distortion=mean"], "algo/distortion=mean does not exist: choose one of cpw, cvar, "),
         ([POW, "map=null"], "map=null chooses nothing: choose one of "),
         ([POW, "+map=easy"], "map is chosen twice: write map=<name> once, without a plus"),
+        ([POW, "+preset=laptop"], "preset is chosen twice: write preset=<name> once, without a plus"),
+        (
+            ["hydra.searchpath=[robotz]", "robot=cart"],
+            "hydra.searchpath=[robotz]: robotz is no folder: name those that",
+        ),
         ([POW, "sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
         # misspelt, unknown and missing keys
         ([POW, "learner.batchsize=3"], "there is no key learner.batchsize: did you mean learner.batch_size?"),
@@ -132,7 +137,7 @@ def refusal(
         ([POW, "map.size_m=big"], "map.size_m=big must be a number"),
         ([POW, "map.num_movers=-1"], "num_movers is -1 but must be"),
         ([POW, "map.layouts=rooms"], "map.layouts=rooms must be a list of words in brackets"),
-        ([POW, "task.motor_steps=[6,a]"], "task.motor_steps=[6, 'a'] must be a list of whole numbers in brackets"),
+        ([POW, "task.motor_steps=[6,a]"], "task.motor_steps=[6, 'a'] must be a whole number or a list of whole"),
         (
             [POW, "task.collision_penalty_mode=never"],
             "task.collision_penalty_mode=never must be one of onset, per_step",
@@ -148,6 +153,10 @@ def refusal(
         ([POW, "logger.backends=csv"], "logger.backends=csv must be a list of words in brackets"),
         # what does not go together
         ([POW, "sensor.memory_s=0"], "network.look_ahead=true reads what is remembered: set sensor.memory_s above 0"),
+        (
+            [POW, "init=rcdsac_pow-narrow", "sensor=sparse", "preset=smoke"],
+            "above 0, or leave sensor out, which init=rcdsac_pow-narrow brings along",
+        ),
         (
             [POW, "collector=parallel_env", "world.num_agents=10", "world.num_workers=3"],
             "num_workers=3 cannot share 10 agents evenly",
@@ -275,11 +284,12 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         (["run=123"], "run=123 must be text or null"),
         ([RUN, "beta=[]"], "beta=[] names none: leave it out for beta=[-2,-1.5,-1,-0.5], or give one"),
         ([RUN, "beta=[-1,-3]"], "beta = -3 is outside the domain [-2, 0] of measure 'pow'"),
-        ([RUN, "beta=-1"], "beta=-1 must be a list of numbers in brackets or null"),
-        ([RUN, "beta=[low]"], "beta=['low'] must be a list of numbers in brackets or null"),
+        ([RUN, "beta=low"], "beta=low must be a number or a list of numbers in brackets or null"),
+        ([RUN, "beta=[low]"], "beta=['low'] must be a number or a list of numbers in brackets or null"),
+        ([RUN, "beta=-3"], "beta = -3 is outside the domain [-2, 0] of measure 'pow'"),
         ([RUN, "beta=[-1,-1.0]"], "beta=-1 is given more than once"),
         ([RUN, "beta=[-1]", "collision_weight=[1]"], "rcdsac_pow has no collision weight: leave collision_weight out"),
-        ([RUN, "beta=[-1]", "sensor=sparse"], "sensor=sparse sensor.memory_s=0 does not fit: "),
+        ([RUN, "beta=[-1]", "sensor=sparse"], "sensor=sparse is not what "),
         ([RUN, "beta=[-1]", "checkpoint=first"], "checkpoint=first must be one of best, last"),
         ([RUN, "beta=[-1]", "split=train"], "split=train must be one of evaluation, validation"),
         ([RUN, "beta=[-1]", "sampled=often"], "sampled=often must be true or false"),
@@ -292,9 +302,10 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         ([RUN, "beta=[-1]", "device=tpu"], "device=tpu is not supported"),
         ([RUN, "beta=[-1]", "map=moon"], "map=moon does not exist: choose one of "),
         ([RUN, "beta=[-1]", "task.episode_step=3"], "there is no key task.episode_step: did you mean task.episode_st"),
+        ([RUN, "beta=[-1]", "task.episode_steps=0"], "task.episode_steps=0 must be at least 1"),
         ([RUN, "beta=[-1]", "task.episode_steps=few"], "task.episode_steps=few must be a whole number"),
         ([RUN, "beta=[-1]", "map.num_movers=-1"], "num_movers is -1 but must be"),
-        ([RUN, "beta=[-1]", "+sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
+        (["baseline=pursuit", "+sensor.name=wide"], "sensor.name=wide is unknown: choose one of full, narrow, sparse"),
         (["baseline=pursuit", "sensor.max_range_m=10"], "there is no key sensor.max_range_m: sensor has name"),
         (["baseline=pursuit", "algo.beta=-1"], "there is no key algo.beta"),
         (
@@ -513,7 +524,7 @@ def test_ctrl_c_and_sigterm_end_with_a_checkpoint_and_without_a_traceback(
     assert err.splitlines()[-1] == f"rcdsac_trl: {told}"
     run = tmp_path / "run"
     assert load_progress(run / "checkpoints", "last").updates >= 2
-    assert f" are saved, resume={run} continues there" in (run / "train.log").read_text()
+    assert f" are saved, continue: {program()} train resume={run}\n" in (run / "train.log").read_text()
     assert (run / "training_episodes.csv").exists()
 
 

@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -14,7 +15,8 @@ from rcdsac_trl import draw_maps
 from rcdsac_trl.cli import read_arguments
 from rcdsac_trl.config.command_line import expanded
 from rcdsac_trl.config.compose import choices, compose, output_folder, parse
-from rcdsac_trl.config.evaluation_settings import EvaluationSettings
+from rcdsac_trl.config.course_settings import CourseSettings
+from rcdsac_trl.config.evaluation_settings import CalibrationSettings, EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.run_config import read_config, training_settings
 from rcdsac_trl.errors import UserInputError
@@ -111,9 +113,38 @@ def test_a_value_that_a_shell_split_at_its_space_is_put_together() -> None:
     assert refusal("evaluate", "run", "=", "x").endswith("write it as <key>=<value>, without spaces around =")
 
 
+@pytest.mark.parametrize(
+    ("config_name", "words", "told"),
+    [
+        ("evaluate", ["rcdsac_pow-narrow"], "rcdsac_pow-narrow cannot be read: did you mean run=rcdsac_pow-narrow?"),
+        ("report", ["sac-narrow"], "sac-narrow cannot be read: did you mean runs=[sac-narrow]?"),
+        ("train", ["rcdsac_pow"], "rcdsac_pow cannot be read: did you mean +algo=rcdsac_pow?"),
+        ("train", [POW, "sparse"], "sparse cannot be read: did you mean sensor=sparse?"),
+        ("train", ["default"], "default cannot be read: write it as <key>=<value>"),  # of several groups
+        ("evaluate", ["--num_maps", "3"], "there is no option --num_maps: did you mean num_maps=3?"),
+        ("evaluate", ["run=x", "--num_maps=3"], "there is no option --num_maps: did you mean num_maps=3?"),
+        (
+            "evaluate",
+            ["--record", "run=x"],
+            "there is no option --record: --help lists them; a key takes no dashes, record=<value>",
+        ),
+    ],
+)
+def test_a_value_without_its_key_is_answered_by_both(config_name: str, words: list[str], told: str) -> None:
+    assert refusal(config_name, *words) == told
+
+
 def test_several_values_are_jobs_for_train_alone() -> None:
     assert ", or add -m to run one job for each, or" in refusal("train", POW, "seed=0,1")
     assert "-m" not in refusal("evaluate", "seed=0,1")
+
+
+@pytest.mark.parametrize(
+    ("verb", "root"),
+    [("evaluate", EvaluationSettings), ("calibrate", CalibrationSettings), ("course", CourseSettings)],
+)
+def test_one_number_is_a_list_of_one(verb: str, root: type[Any]) -> None:
+    assert read_config(compose(verb, ["run=x", "beta=-0.5"]), root).beta == (-0.5,)
 
 
 @pytest.mark.parametrize(("typed", "text"), [("123", "123"), ("1e3", "1000.0"), ("true", "True")])
@@ -186,6 +217,13 @@ def test_a_key_of_an_algorithm_chooses_none() -> None:
 # ------------------------------------------------------------------------------------------------ without torch
 # A mistake of each verb, of each kind that can be told before there is anything to work with.
 MISTAKES = [
+    # first, as those after them import pandas
+    ("report.__main__", ""),
+    ("report.__main__", "runs=nowhere"),
+    ("report.__main__", "runs=[run]"),
+    ("report.__main__", "out=file"),
+    ("draw_maps", "count=0"),
+    ("draw_maps", "out=maps.jpg"),
     ("train", ""),
     ("train", "algo=sac"),
     ("train", f"{POW} learner.batchsize=3"),
@@ -220,7 +258,13 @@ MISTAKES = [
     ("evaluate", "baseline=pursuit half_precision=true"),
     ("evaluate", "baseline=dwaa"),
     ("evaluate", "run=sac-narrow beta=[-1]"),
+    ("evaluate", "run=sac-narrow sensor=sparse"),
+    ("evaluate", "run=sac-narrow +sensor.memory_s=3"),
+    ("evaluate", "run=sac-narrow checkpoint=best"),
+    ("evaluate", "run=sac-narrow half_precision=true"),
     ("calibrate", "run=nowhere"),
+    ("calibrate", "run=sac-narrow"),
+    ("calibrate", "run=rcdsac_pow-narrow beta=-3"),
     ("calibrate", "num_maps=0"),
     ("course", "run=nowhere"),
     ("course", "repetitions=0"),
@@ -228,6 +272,7 @@ MISTAKES = [
     ("export", ""),
     ("export", "run=nowhere"),
     ("export", "run=run out=file"),
+    ("export", "run=sac-narrow out=taken"),
     ("publish", ""),
     ("publish", "runs=[nowhere]"),
     ("publish", "runs=[run] weights=file"),
@@ -244,10 +289,6 @@ MISTAKES = [
     ("replay", "nowhere.bag"),
     ("replay", "recording=file"),
     ("replay", "recording=file run=nowhere"),
-    ("report.__main__", "runs=[nowhere]"),
-    ("report.__main__", "out=file"),
-    ("draw_maps", "count=0"),
-    ("draw_maps", "out=maps.jpg"),
     ("plot_training", ""),
     ("plot_training", "run=nowhere"),
 ]
@@ -261,7 +302,10 @@ for verb, words in json.loads(sys.argv[1]):
     try:
         importlib.import_module(f"rcdsac_trl.{verb}").main()
     except SystemExit as left:
-        told.append((left.code, sorted({"torch", "torchrl", "tensordict"} & set(sys.modules))))
+        late = {"torch", "torchrl", "tensordict"}
+        if verb in ("report.__main__", "draw_maps"):
+            late |= {"pandas", "matplotlib"}
+        told.append((left.code, sorted(late & set(sys.modules))))
     if told[-1] != (2, []):
         sys.exit(f"{verb} {words}: {told[-1]}")
 print(len(told))

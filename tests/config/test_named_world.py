@@ -64,6 +64,8 @@ def test_a_path_is_a_map_of_a_file(tmp_path: Path) -> None:
         ({"map": "file"}, "^map=file does not exist"),
         ({"map": "easy", "map_settings": MapSettings()}, "^map and map_settings both say which maps"),
         ({"robot": "r2d2"}, "^robot=r2d2 does not exist: choose one of jackal, paper, .*, or give a RobotSettings$"),
+        ({"mapp": "easy"}, r"^there is no option mapp: did you mean map\?$"),
+        ({"wheels": 4}, "^there is no option wheels: choose among map, map_settings, task, "),
         ({"sensor": "wide"}, r"^sensor\.name=wide is unknown"),
     ],
 )

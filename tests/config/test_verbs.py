@@ -128,6 +128,17 @@ def test_listing_verbs_imports_nothing_heavy() -> None:
     assert done.stdout == "[]\n"
 
 
+def test_a_reader_that_leaves_is_no_fault() -> None:
+    """As ``rcdsac-trl --help | head -1`` may leave before all is written."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = subprocess.run([sys.executable, "-m", "rcdsac_trl"], stdout=writer, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(writer)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 # ------------------------------------------------------------------------------------------------ help
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_explains_keys_with_the_comments_of_conf(verb: str) -> None:
@@ -161,6 +172,8 @@ def test_help_shows_values_with_what_was_chosen() -> None:
     assert "  schedule.iterations=150\n" in verb_help("train")
     assert "  schedule.iterations=500\n" in verb_help("train", ["preset=paper"])
     assert "  robot: jackal, paper (default), turtlebot3_burger, turtlebot4\n" in verb_help("train")
+    assert "barn, " in verb_help("evaluate")
+    assert not any("barn, " in verb_help(verb) for verb in ("train", "search"))  # which nothing trains on
     with pytest.raises(UserInputError, match=r"^preset=tiny does not exist"):
         verb_help("train", ["preset=tiny"])
 
@@ -187,7 +200,9 @@ def test_hydras_own_help_is_kept(monkeypatch: pytest.MonkeyPatch, capsys: pytest
 @pytest.fixture(scope="module")
 def completed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[str]]:
     """Complete a line as bash does."""
-    script = tmp_path_factory.mktemp("completion") / "rcdsac-trl"
+    folder = tmp_path_factory.mktemp("completion")
+    (folder / "runs").mkdir()
+    script = folder / "rcdsac-trl"
     script.write_text(bash_completion())
     code = (
         f'source {script}; COMP_LINE=$1; COMP_POINT=${{#1}}; read -ra COMP_WORDS <<<"$1"; '
@@ -195,7 +210,9 @@ def completed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[
     )
 
     def complete(line: str) -> list[str]:
-        done = subprocess.run(["bash", "-c", code, "bash", line], capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["bash", "-c", code, "bash", line], cwd=folder, capture_output=True, text=True, check=True
+        )
         assert done.stderr == ""
         return done.stdout.splitlines()
 
@@ -210,8 +227,14 @@ def completed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], list[
         ("rcdsac-trl plo", ["plot_training "]),
         ("rcdsac-trl train sensor=", ["full", "narrow", "sparse"]),
         ("rcdsac-trl train +algo=s", ["sac "]),
+        ("rcdsac-trl evaluate map=b", ["barn "]),
+        ("rcdsac-trl train map=b", [""]),  # which nothing trains on
+        ("rcdsac-trl search map=b", [""]),
         ("rcdsac-trl train seed=1 learner.ga", ["learner.gamma="]),
-        ("rcdsac-trl evaluate run=ru", [""]),  # left to bash, which knows files
+        ("rcdsac-trl evaluate run=rcdsac_pow-n", ["rcdsac_pow-narrow "]),
+        ("rcdsac-trl train init=sac-n", ["sac-narrow "]),
+        ("rcdsac-trl evaluate run=ru", ["runs/"]),
+        ("rcdsac-trl evaluate out=ru", [""]),  # left to bash, which knows files
         ("rcdsac-trl nothing x", [""]),
     ],
 )

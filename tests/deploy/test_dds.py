@@ -399,7 +399,7 @@ def test_wrong_input_ends_in_one_sentence(
     with pytest.raises(SystemExit, match="2"):
         dds_node.main(arguments if arguments == ["nobody"] else [str(folder), *arguments])
     printed = capsys.readouterr()
-    assert re.search(said, printed.err)
+    assert re.search(f"^rcdsac_trl: .*{said}", printed.err)
     assert printed.err.count("\n") == 1
     assert not printed.out
 

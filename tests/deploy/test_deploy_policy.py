@@ -235,7 +235,7 @@ GOOD: dict[str, Any] = {"ranges": OPEN, "waypoints": AHEAD, "velocity": STANDING
 NAN, TURN = math.nan, 2 * math.pi
 LOST = Sectors(OPEN, np.arange(180) >= 10)
 BAD: list[tuple[dict[str, Any], str]] = [
-    ({"ranges": None}, "ranges are not numbers"),
+    ({"ranges": None}, "^ranges are missing: give numbers"),
     ({"ranges": "far"}, "ranges are not numbers"),
     ({"ranges": OPEN[:179]}, r"ranges have shape \[179\]"),
     ({"ranges": np.where(np.arange(180) == 3, NAN, OPEN)}, "hold NaN"),
@@ -245,11 +245,12 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"ranges": LOST}, "23 % of the range bins this agent sees are not measured, more than 10 %"),
     ({"ranges": Scan(np.full(360, 1.0), 0.0, TURN / 360, 0.1, 2.0)}, "reaches so far"),
     ({"ranges": Scan(np.full(360, NAN), 0.0, TURN / 360, 0.1, 5.0)}, "100 % of the range bins"),
-    ({"waypoints": None}, "waypoints are not numbers"),
+    ({"waypoints": None}, "^waypoints are missing: give numbers"),
+    ({"velocity": None}, "^velocity is missing: give numbers"),
     ({"waypoints": []}, r"waypoints have shape \[0\]"),
     ({"waypoints": [[1.0, NAN], [1.0, 1.0]]}, "waypoints are not all finite"),
     ({"waypoints": [[1500.0, 0.0], [1.0, 1.0]]}, "out of sight"),
-    ({"velocity": [0.1]}, r"velocity have shape \[1\]"),
+    ({"velocity": [0.1]}, r"velocity has shape \[1\]"),
     ({"velocity": [math.inf, 0.0]}, "velocity is not finite"),
     ({"velocity": [0.0, 45.0]}, "not in m/s and rad/s"),
     ({"beta": NAN}, "beta is no finite number"),

@@ -216,7 +216,7 @@ def test_what_cannot_be_read_stops_the_robot_and_says_why(odd: Any, told: str) -
 
 @pytest.mark.parametrize("change", [{"ranges": ALL}, {"ranges": Sectors(ALL, ALL)}, {"velocity": [False, False]}])
 def test_true_is_not_1_m(change: dict[str, Any]) -> None:
-    assert "are not numbers but bool" in str(Policy(agent()).act(**given(**change)).reason)
+    assert "not numbers but bool" in str(Policy(agent()).act(**given(**change)).reason)
 
 
 @pytest.mark.parametrize(

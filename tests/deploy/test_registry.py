@@ -1,5 +1,7 @@
 """Agents by name: where they are looked for, which comes first, and what is said where one is missing."""
 
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -87,12 +89,42 @@ def test_what_is_missing_is_named_with_the_nearest_or_the_way_to_it(own: Path) -
     written(own / "rcdsac_pow-narrow")  # of two that are as near the one that is there
     with pytest.raises(UserInputError, match=r"^there is no agent 'rcdsac_pow': did you mean rcdsac_pow-narrow\?"):
         find_weights("rcdsac_pow")
+    for name in ("sac-sparse", "sac-narrow", "rcdsac_pow-sparse", "rcdsac_pow_wide-narrow"):
+        written(own / name)
+    for typed, meant in {
+        "rcdsac_pow": "rcdsac_pow-narrow",
+        "sac": "sac-narrow",
+        "rcdsac_cv": "rcdsac_cvar-narrow",
+    }.items():
+        with pytest.raises(UserInputError, match=rf"^there is no agent '{typed}': did you mean {meant}\?"):
+            find_weights(typed)
+    # Who takes no run folder offers none.
+    with pytest.raises(UserInputError, match=r"^there is no agent 'quick': .*; or name a folder that `export` wrote$"):
+        find_weights("quick", takes_runs=False)
+    with pytest.raises(UserInputError, match=r"own holds no config\.json: .*; or name a folder that `export` wrote$"):
+        find_weights(own, takes_runs=False)
     with pytest.raises(UserInputError) as raised:
         find_weights("dsac_pow_-2-sparse")
     assert f"agent dsac_pow_-2-sparse is not here (looked into {own})" in str(raised.value)
     assert "let RCDSAC_TRL_WEIGHTS name the folder weights/ of a checkout" in str(raised.value)
     trained = "-m +experiment=table preset=laptop sensor=sparse seed=0 experiment.only=[dsac_pow_-2]"
     assert str(raised.value).endswith(f"or train it, python -m rcdsac_trl.train {trained}")
+
+
+@pytest.mark.parametrize(("given", "kind"), [(None, "NoneType"), (3, "int"), (["sac-narrow"], "list")])
+def test_what_names_nothing_is_no_agent(given: object, kind: str) -> None:
+    with pytest.raises(UserInputError, match=f"^an agent is no {kind}: give its name, such as 'rcdsac_pow-narrow', or"):
+        rcdsac_trl.load(given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("package", ["safetensors", "numba"])
+def test_a_package_that_a_robot_lacks_is_named_with_how_to_get_it(package: str) -> None:
+    code = f"import sys; sys.modules[{package!r}] = None; import rcdsac_trl; rcdsac_trl.load('rcdsac_pow-narrow')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr.splitlines()[-1] == (
+        f"rcdsac_trl.errors.UserInputError: {package} is not installed: shipped and exported agents need `pip install "
+        "numpy safetensors numba`, a run folder all that rcdsac-trl depends on"
+    )
 
 
 def test_the_table_and_the_wheel_have_the_agents_that_are_named() -> None:

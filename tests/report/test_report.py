@@ -429,6 +429,14 @@ def test_an_evaluation_in_a_few_lines(tmp_path: Path) -> None:
     assert len(pd.read_csv(folder / "collision_summary.csv")) == 4
 
 
+def test_one_episode_has_no_spread(tmp_path: Path) -> None:
+    folder = evaluate(tmp_path / "a", "pursuit", {NONE: 0})
+    episodes = pd.read_csv(folder / "episodes.csv").assign(contact_fraction=0.0)
+    episodes[:1].to_csv(folder / "episodes.csv", index=False)
+    with_collisions(folder, [])
+    assert summarised(folder).splitlines()[2].count(" ± –  ") == 5
+
+
 def test_a_few_lines_name_controllers_weights_and_who_is_told_nothing(tmp_path: Path) -> None:
     def named(folder: Path) -> list[str]:
         episodes = pd.read_csv(folder / "episodes.csv").assign(contact_fraction=0.0)

@@ -23,7 +23,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     return wait
 
 
-def test_the_rest_is_guessed_by_the_pace_since_the_first_part(
+def test_the_rest_is_guessed_by_the_pace_since_the_first_share(
     clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Work("12 runs", 12, "run") as work:
@@ -45,18 +45,20 @@ def test_the_rest_is_guessed_by_the_pace_since_the_first_part(
         assert capsys.readouterr().err == "rcdsac_trl: 1 of 12 runs, about 4 min left (at work for 70 s)\n"
 
 
-def test_nothing_is_guessed_from_a_first_step(
+def test_nothing_is_guessed_from_the_first_steps(
     clock: Callable[[float], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with Work("50 maps", 50, "map") as work:
         work.reach(0.001)
         clock(30.0)  # something is compiled
-        work.reach(0.002)
+        work.reach(0.5)
+        clock(4.0)
+        work.reach(2.4)
         assert (work.left_s(), str(work)) == (None, "0 of 50 maps")
-        clock(2.0)
-        work.reach(0.321)  # 0.32 maps in 32 s
-        assert work.left_s() == pytest.approx(100.0 * (50 - 0.321))
-    assert capsys.readouterr().err == "rcdsac_trl: 50 maps\nrcdsac_trl: 0 of 50 maps, about 83 min left\n"
+        clock(0.2)
+        work.reach(2.6)  # 2.1 maps in 4.2 s
+        assert work.left_s() == pytest.approx(2.0 * (50 - 2.6))
+    assert capsys.readouterr().err == "rcdsac_trl: 50 maps\nrcdsac_trl: 0 of 50 maps, about 95 s left\n"
 
 
 def test_one_unit_is_told_by_its_share(clock: Callable[[float], None]) -> None:
@@ -81,6 +83,8 @@ def test_nothing_is_silent_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "print", note, raising=False)
     with never_silent(silence_s=0.001):
         assert enough.wait(timeout=60)
+        assert told[0].endswith(" s: it imports and reads, and the first call after an installation compiles")
+        assert told[1].endswith(" s")  # said once
         enough.clear()
         told.clear()
         with Work("two maps", 2, "map") as work:

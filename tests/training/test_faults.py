@@ -32,6 +32,7 @@ from rcdsac_trl.rollout.policies import CollectionPolicy
 from rcdsac_trl.rollout.worker_processes import RolloutRequest, WorkerProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress, newest
 from rcdsac_trl.system import resources
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.setup import resume_training
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.task.agent_group import AgentGroup
@@ -150,8 +151,8 @@ def test_a_worker_that_hangs_counts_as_dead_and_too_many_faults_end_the_run(
     told = (
         "iteration 2, training map 2: one of 2 worker processes (split train, seed 0, agents 0; split train, seed 0, "
         "agents 1) gave no answer within 6 s; "
-        f"world.max_restarts=1 allows no further restart: training stops; 1 iterations are saved, resume={run} "
-        "continues there"
+        f"world.max_restarts=1 allows no further restart: training stops; 1 iterations are saved, "
+        f"continue: {program()} train resume={run}"
     )
     with pytest.raises(TrainingError, match=re.escape(told)):
         trainer.run()
@@ -277,7 +278,7 @@ def test_a_real_limit_on_files_ends_a_run_in_one_sentence(tmp_path: Path, backen
     assert ended.code() == 1, ended.said
     told = (
         r"rcdsac_trl: a file became larger than this system or its limits allow \(.*File too large\): training stops "
-        rf"in iteration 1; 0 iterations are saved, resume={run} continues there\n"
+        rf"in iteration 1; 0 iterations are saved, continue: {re.escape(program())} train resume={run}\n"
     )
     assert re.fullmatch(told, ended.said), ended.said
     saved, damaged = newest(run / CHECKPOINTS, replay=run / "replay")

@@ -448,9 +448,13 @@ def test_a_folder_is_continued_as_it_was_started(command: Any, copied: Path, sho
 def test_what_contradicts_a_run_is_refused_by_name(refusal: Any, copied: Path, override: str) -> None:
     noted_overrides(copied, START)
     told = refusal([f"resume={unfinished(copied)}", override])
+    new = "start a new run without resume"
+    if override.startswith("schedule.iterations"):
+        again = f"{program()} train init={copied} schedule.iterations=<how many more>"
+        new = f"for more iterations begin a new run with its agent: {again}"
     assert told == (
         f"{override} is not what {copied} was started with, and resume continues a run as it was: leave it out, or "
-        "start a new run without resume"
+        f"{new}"
     )
 
 

@@ -24,6 +24,7 @@ from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.metrics import METRICS
 from rcdsac_trl.storage.checkpoint import load_weights
 from rcdsac_trl.storage.checkpoint_record import Progress, load_progress
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.training.learner import LOSS_KEYS, Learner
 from rcdsac_trl.training.restart_budget import RestartBudget
@@ -372,6 +373,11 @@ def test_a_hook_sees_every_iteration_once_it_is_logged_and_before_it_is_saved(tm
     assert seen == [(1, 0, 0.0), (2, 1, 22.0), (3, 2, 44.0)]
 
 
+def continuation(folder: Path) -> str:
+    """Return what is said of how a run goes on: a line to be copied."""
+    return f"continue: {program()} train resume={folder}"
+
+
 def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
     def stop(trainer: Trainer, record: Mapping[str, float]) -> None:
         if trainer.progress.iterations == 2:
@@ -381,7 +387,7 @@ def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
     stub_trainer(tmp_path, events, validate_every=100, on_iteration_end=stop).run()
     assert [event[1].iterations for event in kinds(events, "save")] == [0, 2]
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
-    sentence = f"stopped after 2 iterations (good enough); 2 iterations are saved, resume={tmp_path} continues there"
+    sentence = f"stopped after 2 iterations (good enough); 2 iterations are saved, {continuation(tmp_path)}"
     assert (tmp_path / "train.log").read_text().splitlines()[-1] == sentence
 
     def fail(trainer: Trainer, record: Mapping[str, float]) -> None:
@@ -390,7 +396,7 @@ def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
     events.clear()
     with pytest.raises(ZeroDivisionError):
         stub_trainer(tmp_path, events, checkpoint_every=1, on_iteration_end=fail).run()
-    sentence = f"on_iteration_end failed in iteration 1 (ZeroDivisionError:); 0 iterations are saved, resume={tmp_path}"
+    sentence = "on_iteration_end failed in iteration 1 (ZeroDivisionError:); 0 iterations are saved, continue: "
     assert sentence in (tmp_path / "train.log").read_text()
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
 
@@ -402,7 +408,7 @@ def test_ctrl_c_drops_the_iteration_and_closes_everything(tmp_path: Path) -> Non
         trainer.run()
     assert [event[1].iterations for event in kinds(events, "save")] == [0, 1, 2]
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
-    told = f"interrupted in iteration 3; 2 iterations are saved, resume={tmp_path} continues there"
+    told = f"interrupted in iteration 3; 2 iterations are saved, {continuation(tmp_path)}"
     assert told in (tmp_path / "train.log").read_text().splitlines()
 
 
@@ -736,7 +742,7 @@ def test_workers_that_fail_too_often_end_a_run(tmp_path: Path, faulty: set[int])
     trainer = stub_trainer(tmp_path, events, checkpoint_every=1, max_restarts=1)
     told = (
         "iteration 3, training map 3: worker process 1 of 1 was killed by SIGKILL; world.max_restarts=1 allows no "
-        f"further restart: training stops; 2 iterations are saved, resume={tmp_path} continues there"
+        f"further restart: training stops; 2 iterations are saved, {continuation(tmp_path)}"
     )
     with pytest.raises(TrainingError, match=re.escape(told)):
         trainer.run()

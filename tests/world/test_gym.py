@@ -38,6 +38,8 @@ def test_what_is_no_setting_and_no_option_is_refused() -> None:
     for options in ("x", 5, ["episode"]):
         with pytest.raises(UserInputError, match="are no dictionary"):
             env.reset(options=options)  # type: ignore[arg-type]
+    with pytest.raises(UserInputError, match=r"^a reset has no option 'episod': give {'episode': <number>}, or none$"):
+        env.reset(options={"episod": 3})
     env.close()
 
 

@@ -424,7 +424,11 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "json without a size": (text("a.json", '{"walls": []}'), "is no map: 'size_m' is missing"),
     "json with a strange key": (
         text("a.json", '{"size_m": 9, "doors": []}'),
-        "is no map: there is no key doors, a map has layout",
+        "is no map: there is no key doors, a map has format, walls, wall_thickness_m, layout, size_m, boxes",
+    ),
+    "json with a mistyped key": (
+        text("a.json", '{"size_m": 9, "boxs": []}'),
+        "is no map: there is no key boxs: did you mean boxes?",
     ),
     "json with a strange key of a box": (
         text("a.json", '{"size_m": 9, "boxes": [{"x": 1, "y": 1, "half": 1}]}'),

@@ -281,5 +281,5 @@ def test_settings_turn_lists_into_tuples():
     ],
 )
 def test_settings_outside_their_limits_are_refused(name, value):
-    with pytest.raises(UserInputError, match=name):
+    with pytest.raises(UserInputError, match=rf"^task\.{name}="):
         TaskSettings(**{name: value})

@@ -81,6 +81,19 @@ def assigned(key: str, value: str) -> str:
     return f"{key}={value}" if re.fullmatch(_PLAIN, value) else quoted(key, value)
 
 
+def listed(key: str, value: str) -> str:
+    """Write an override whose value is a list of one text, as :func:`assigned` does.
+
+    Example:
+        >>> print(listed("runs", "runs/a"), listed("runs", "my runs/a"))
+        runs=[runs/a] 'runs=["my runs/a"]'
+    """
+    if re.fullmatch(_PLAIN, value):
+        return f"{key}=[{value}]"
+    escaped = value.replace('"', '\\"')
+    return shlex.quote(f'{key}=["{escaped}"]')
+
+
 def with_names(key: str, words: Sequence[str]) -> list[str]:
     """Put the key before names that stand first without it, in one list.
 
@@ -96,8 +109,16 @@ def with_names(key: str, words: Sequence[str]) -> list[str]:
     return [*([f"{key}=[{listed_names}]"] if names else []), *words[len(names) :]]
 
 
-def unreadable(override: str, overrides: list[str]) -> str:
-    """Say what to write in place of an override that Hydra's grammar does not take."""
+def unreadable(override: str, overrides: list[str], meant: str | None = None) -> str:
+    """Say what to write in place of an override that Hydra's grammar does not take.
+
+    Args:
+        override: which one.
+        overrides: all of them.
+        meant: what was probably meant by it, if that is known.
+    """
+    if meant is not None:
+        return f"{override} cannot be read: did you mean {meant}?"
     key, equals, value = override.partition("=")
     sentence = f"{override} cannot be read: write it as <key>=<value>"
     number = overrides.index(override) if override in overrides else 0
@@ -107,6 +128,24 @@ def unreadable(override: str, overrides: list[str]) -> str:
             return f"{sentence}, or, if it belongs to what stands before it, {quoted(start, f'{text} {override}')}"
         return sentence
     return f"{sentence}, lists in brackets, and a text with characters such as , = ( [ as {quoted(key, value)}"
+
+
+def no_option(option: str, argv: Sequence[str]) -> str:
+    """Say what to write in place of an option that does not exist: a key takes no dashes.
+
+    Example:
+        >>> no_option("--num_maps", ["run=a", "--num_maps", "3"])
+        'there is no option --num_maps: did you mean num_maps=3?'
+    """
+    key, equals, value = option.removeprefix("--").partition("=")
+    if not option.startswith("--") or not re.fullmatch(r"[A-Za-z_][\w.]*", key):
+        return f"there is no option {option}: --help lists them; put a value with spaces in quotes"
+    behind = next(iter(argv[argv.index(option) + 1 :]), "-") if option in argv else "-"
+    if not equals and not behind.startswith("-") and "=" not in behind:
+        equals, value = "=", behind
+    if equals:
+        return f"there is no option --{key}: did you mean {assigned(key, value)}?"
+    return f"there is no option {option}: --help lists them; a key takes no dashes, {key}=<value>"
 
 
 def several(override: str, *, as_jobs: bool) -> str:

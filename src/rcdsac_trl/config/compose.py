@@ -16,7 +16,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.config.command_line import key_of, several, unreadable
+from rcdsac_trl.config.command_line import assigned, key_of, listed, several, unreadable
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.typed import unknown_key
 from rcdsac_trl.errors import UserInputError, first_line
@@ -100,12 +100,23 @@ def _compose(config_name: str, overrides: list[str], *, return_hydra_config: boo
     for override in overrides:
         if not key_of(override).partition("@")[0].strip():  # Hydra fails an assertion
             raise UserInputError(f"{override} names no key: write it as <key>=<value>, without spaces around =")
+        if key_of(override) == "hydra.searchpath":
+            _check_searchpath(override)
     overrides = with_sections(config_name, overrides)
     with _initialized():
         try:
             return hydra.compose(config_name, overrides=overrides, return_hydra_config=return_hydra_config)
         except (HydraException, OmegaConfBaseException, ValueError) as error:
             raise UserInputError(_sentence(error, config_name, overrides)) from error
+
+
+def _check_searchpath(override: str) -> None:
+    """Refuse what is no folder: Hydra would only warn, and then miss what it is to find there."""
+    named = parse([override])[0].value()
+    for place in named if isinstance(named, list) else [named]:
+        path = str(place).removeprefix("file://")
+        if "://" not in path and not os.path.isdir(path):
+            raise UserInputError(f"{override}: {path} is no folder: name those that hold configs of yours")
 
 
 def _initialized() -> AbstractContextManager[None]:
@@ -159,27 +170,50 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF_DIR / group).glob("*.yaml"))
 
 
+def offered(config_name: str, group: str) -> list[str]:
+    """List the options of a group that a root can work with: nothing trains on the test that ``map=barn`` is."""
+    trains = config_name in ("train", "search", "sweep")
+    return [option for option in choices(group) if not (trains and (group, option) == ("map", "barn"))]
+
+
 def _sentence(error: Exception, config_name: str, overrides: list[str]) -> str:
     text = str(error)
     if isinstance(error, OverrideParseException):
-        return unreadable(error.override or "", overrides)
+        word = error.override or ""
+        return unreadable(word, overrides, _meant(word, config_name) if config_name else None)
     if match := re.search(r"(?:Could not find|load) '([\w/]+)/([^/']*)'", text):
         group, name = match.groups()
-        known = choices(group)
+        known = offered(config_name, group)
         return f"{group}={name} does not exist: " + (f"choose one of {', '.join(known)}" if known else "leave it out")
     for override in overrides:
         group, _, name = override.lstrip("+").partition("=")
         if name == "null" and choices(group):
-            return f"{group}=null chooses nothing: choose one of {', '.join(choices(group))}"
+            return f"{group}=null chooses nothing: choose one of {', '.join(offered(config_name, group))}"
     if config_name == "train" and any(override.startswith("algo=") for override in overrides):
         return f"write +algo=<name> (with a plus): one of {', '.join(choices('algo'))}"
     if match := re.match(r"Ambiguous value for argument '([^']+)'", text):
         return several(match[1], as_jobs=config_name == "train")
-    if match := re.match(r"Multiple values for (\S+)\.", text):
-        return f"{match[1]} is chosen twice: write {match[1]}=<name> once, without a plus"
+    if match := re.match(r"Multiple values for (\S+)\.|(\S+) appears more than once in the final defaults list", text):
+        group = match[1] or match[2]
+        return f"{group} is chosen twice: write {group}=<name> once, without a plus"
     if match := re.match(r"Could not override '([^']+)'", text):
         return _no_key(match[1], config_name, overrides)
     return " ".join(text.split())
+
+
+def _meant(word: str, config_name: str) -> str | None:
+    """Return the override of which a word is the value: a choice of one group alone, or an agent."""
+    groups = [group for group in root_groups(config_name) if word in choices(group)]
+    if len(groups) == 1:
+        return f"{'+' if groups[0] == 'algo' else ''}{groups[0]}={word}"
+    from rcdsac_trl.deploy.policy.registry import shipped_names  # late: whoever mistypes nothing does not wait for it
+
+    keys = OmegaConf.load(CONF_DIR / f"{config_name}.yaml")
+    if word not in shipped_names():
+        return None
+    if "run" in keys:
+        return assigned("run", word)
+    return listed("runs", word) if "runs" in keys else None
 
 
 def _no_key(key: str, config_name: str, overrides: list[str]) -> str:

@@ -211,16 +211,32 @@ class EvaluationSettings:
 
         Raises:
             UserInputError: for a key or a value that they do not have, worlds of BARN that are not there, and another
-                robot than an agent was trained for.
+                sensor or robot than an agent was trained with.
         """
         maps = _changed_maps(trained.map, self.map)
-        sensor, task = _changed(trained.sensor, self.sensor, "sensor"), _changed(trained.task, self.task, "task")
+        sensor, task = self._sensor_of(trained), _changed(trained.task, self.task, "task")
         robot = self._robot_of(trained)
         if not isinstance(maps, BarnMapSettings):
             return ChosenWorld(maps, sensor, task, robot)
         steps = math.ceil(TIME_LIMIT_S / (min(task.motor_steps) * robot.motor_period_s))
         task = replace(task, goal_radius_m=GOAL_RADIUS_M, episode_steps=steps)
         return ChosenWorld(maps.files(), sensor, task, robot, maps)
+
+    def _sensor_of(self, trained: TrainingSettings) -> SensorSettings:
+        """Return the sensor: that of a training, or for a baseline the one that was chosen."""
+        sensor = _changed(trained.sensor, self.sensor, "sensor")
+        if self.run is None:
+            return replace(sensor, memory_s=0.0)  # baselines do not read what is remembered
+        if sensor.name != trained.sensor.name:
+            chosen, was = f"sensor={sensor.name}", trained.sensor.name
+        # Who chooses the sensor's name alone chooses no memory.
+        elif sensor.memory_s not in (0.0, trained.sensor.memory_s):
+            chosen, was = f"sensor.memory_s={sensor.memory_s:g}", f"{trained.sensor.memory_s:g}"
+        else:
+            return trained.sensor
+        raise UserInputError(
+            f"{chosen} is not what {self.run} was trained with ({was}): leave it out, or take another agent"
+        )
 
     def _robot_of(self, trained: TrainingSettings) -> RobotSettings:
         """Return the robot: that of a training, or for a baseline the one that was chosen."""
@@ -312,6 +328,26 @@ class CalibrationSettings:
             )
         resolve_processes(self.num_workers, self.num_maps)
         runtime.resolve_threads(self.threads)
+
+    def conditions_of(self, trained: TrainingSettings) -> list[Condition]:
+        """Return the conditions under which the critics of an agent are measured.
+
+        Raises:
+            UserInputError: for critics without quantiles, values of beta that the agent does not take, and a
+                cross-evaluation of a single one.
+        """
+        if trained.algo.critic != "quantile":
+            raise UserInputError(
+                f"run={self.run} has {trained.algo.critic} critics, which predict no quantiles: name an agent of "
+                "another row"
+            )
+        conditions = trained.algo.conditions(self.beta, None)
+        if self.cross_evaluate and len(conditions) < 2:
+            raise UserInputError(
+                f"cross_evaluate=true holds values of beta against each other, and {self.run} is asked for one: give "
+                "two or more to a risk-conditioned agent, such as beta=[0.25,1], or leave cross_evaluate out"
+            )
+        return conditions
 
     def horizon_in(self, episode_steps: int) -> int:
         """Return the steps of a roll-out in episodes of some length: half of one, unless a user says otherwise.

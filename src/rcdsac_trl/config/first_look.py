@@ -24,7 +24,7 @@ from rcdsac_trl.deploy import find_weights
 from rcdsac_trl.deploy.recordings.open_recording import open_recording
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.listening import check_can_listen
-from rcdsac_trl.system.resources import check_out, check_writable
+from rcdsac_trl.system.resources import check_empty, check_out, check_writable
 from rcdsac_trl.world.maps.map_source import check_maps
 from rcdsac_trl.world.task.world_settings import WorldSettings
 
@@ -36,7 +36,10 @@ def look_at_evaluation(cfg: DictConfig) -> None:
         UserInputError: naming what is wrong.
     """
     settings = read_config(cfg, EvaluationSettings)
-    trained = default_training() if settings.run is None else find_agent(settings.run).settings()
+    if settings.run is None:
+        trained = default_training()
+    else:
+        trained = find_agent(settings.run, settings.checkpoint, half_precision=settings.half_precision).settings()
     settings.conditions_of(trained)
     chosen = settings.world_of(trained)
     WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=chosen.robot)
@@ -52,7 +55,9 @@ def look_at_calibration(cfg: DictConfig) -> None:
     """
     settings = read_config(cfg, CalibrationSettings)
     if settings.run is not None:
-        trained = find_agent(settings.run).settings()
+        found = find_agent(settings.run, settings.checkpoint, half_precision=settings.half_precision)
+        trained = found.settings()
+        settings.conditions_of(trained)
         settings.horizon_in(trained.task.episode_steps)
         settings.check_missing(trained.learner.gamma, trained.task.episode_steps)
         settings.acting_of(trained)
@@ -80,9 +85,10 @@ def look_at_export(cfg: DictConfig) -> None:
         UserInputError: naming what is wrong.
     """
     settings = read_config(cfg, ExportSettings)
-    if settings.run is not None and (found := find_agent(settings.run)).is_run:
+    if settings.run is not None and (found := find_agent(settings.run, settings.checkpoint)).is_run:
         agent_of_run(found.path)
-    _look_at_out(settings.out)
+    if settings.out is not None:
+        check_empty(Path(settings.out))
 
 
 def look_at_publication(cfg: DictConfig) -> None:
@@ -132,7 +138,7 @@ def look_at_replay(cfg: DictConfig) -> None:
         UserInputError: naming what is wrong.
     """
     settings = read_config(cfg, ReplaySettings)
-    find_agent(settings.run)
+    find_agent(settings.run, settings.checkpoint)
     assert settings.recording is not None
     open_recording(Path(settings.recording))
     _look_at_out(settings.out)

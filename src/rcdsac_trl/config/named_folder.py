@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rcdsac_trl.config.compose import compose
+from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import (
     CHECKPOINTS,
     CONFIG_NAME,
@@ -14,6 +15,7 @@ from rcdsac_trl.config.run_config import (
 )
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.policy.registry import find_weights
+from rcdsac_trl.deploy.policy.weights import read_agent_config
 from rcdsac_trl.errors import UserInputError
 
 
@@ -38,14 +40,37 @@ class NamedFolder:
         return settings_of_run(self.path) if self.is_run else settings_of_export(self.path)
 
 
-def find_agent(named: str | Path) -> NamedFolder:
+def find_agent(named: str | Path, checkpoint: Name | None = None, *, half_precision: bool = False) -> NamedFolder:
     """Return the folder of a name: of a run, one that ``export`` wrote, or that of an agent that is shipped.
 
     A run folder comes first, then a weights folder, then a shipped agent.
 
+    Args:
+        named: what the user says.
+        checkpoint: that was chosen; None: none was.
+        half_precision: whether its weights are to be rounded.
+
     Raises:
-        UserInputError: if there is none.
+        UserInputError: if there is none, or what is there is one agent as it was written, which leaves no such choice.
     """
+    found = _find(named)
+    if found.is_run:
+        return found
+    if half_precision:
+        raise UserInputError(
+            f"half_precision=true rounds the agent of a run, and run={named} is one that has been written: leave it out"
+        )
+    if checkpoint is not None:
+        own = read_agent_config(found.path)[0].provenance.get("checkpoint")
+        if checkpoint != own:
+            raise UserInputError(
+                f"checkpoint={checkpoint} chooses among those of a run, and run={named} is one agent, of checkpoint "
+                f"{own}: leave it out"
+            )
+    return found
+
+
+def _find(named: str | Path) -> NamedFolder:
     folder = Path(named)
     if os.path.isdir(folder / CHECKPOINTS):  # false for a name that is too long, too
         return NamedFolder(folder, is_run=True)

@@ -1,6 +1,9 @@
 """Environments by the names of ``conf/``, for who uses them from Python."""
 
-from dataclasses import dataclass
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,12 @@ from rcdsac_trl.world.task.world_settings import WorldSettings
 
 # Of these map sets a path says which maps they are.
 _OF_FILES = ("file", "barn")
+_OF_WORLD = ("map", *(field.name for field in fields(WorldSettings)))
+_OF_ENV = tuple(
+    name
+    for name, parameter in signature(NavigationGymEnv).parameters.items()
+    if parameter.kind is Parameter.KEYWORD_ONLY
+)
 
 
 @dataclass(frozen=True)
@@ -27,7 +36,7 @@ class _Maps:
 
 def named_world(**options: Any) -> WorldSettings:
     """Return what an environment is made of, see :func:`rcdsac_trl.world_settings`."""
-    return WorldSettings(**_resolved(options))
+    return WorldSettings(**_resolved(options, _OF_WORLD))
 
 
 def gymnasium_env(world: WorldSettings | None = None, **options: Any) -> NavigationGymEnv:
@@ -38,11 +47,20 @@ def gymnasium_env(world: WorldSettings | None = None, **options: Any) -> Navigat
         options: of :class:`~rcdsac_trl.world.task.gymnasium_env.NavigationGymEnv`, and `map` and `robot` by name, see
             :func:`rcdsac_trl.world_settings`.
     """
-    return NavigationGymEnv(world, **_resolved(options))
+    return NavigationGymEnv(world, **_resolved(options, (*_OF_WORLD, *_OF_ENV)))
 
 
-def _resolved(options: dict[str, Any]) -> dict[str, Any]:
-    """Return options with settings in place of names."""
+def _resolved(options: dict[str, Any], known: Sequence[str]) -> dict[str, Any]:
+    """Return options with settings in place of names.
+
+    Args:
+        options: what was given.
+        known: names of all that may be.
+    """
+    if strange := next((name for name in options if name not in known), None):
+        near = difflib.get_close_matches(strange, known, n=1)
+        others = f"did you mean {near[0]}?" if near else f"choose among {', '.join(known)}"
+        raise UserInputError(f"there is no option {strange}: {others}")
     resolved = dict(options)
     if (named := resolved.pop("map", None)) is not None:
         if "map_settings" in options:

@@ -57,7 +57,7 @@ class VerificationSettings:
 
 
 def _with_claims(name: str) -> Weights:
-    folder = find_weights(name)
+    folder = find_weights(name, takes_runs=False)
     weights = read_weights(folder)
     if weights.measured is None:
         raise UserInputError(f"{folder} holds no {MEASURED_NAME}, so that its agent claims nothing: leave {name} out")

@@ -180,7 +180,11 @@ class TrainingSettings:
         if self.network.look_ahead and self.sensor.memory_s == 0.0:
             raise UserInputError(
                 "network.look_ahead=true reads what is remembered: set sensor.memory_s above 0, or "
-                "network.look_ahead=false acting.margin_m=0"
+                + (
+                    "network.look_ahead=false acting.margin_m=0"
+                    if self.init is None
+                    else f"leave sensor out, which init={self.init} brings along"
+                )
             )
         self.acting.check_heads(self.network.look_ahead)
         iteration_steps = self.training_world.num_agents * episode_steps

@@ -22,8 +22,9 @@ def read(cls: type[Settings], values: Mapping[str, Any], section: str = "") -> S
     """Make a settings dataclass of a section whose keys are its fields; a field may be a section of its own.
 
     Understood are ``bool``, ``int``, ``float`` (which takes whole numbers, and nothing infinite), ``str``,
-    ``Literal``, ``None``, tuples (from lists), dataclasses (from sections), mappings from text (from sections with keys
-    of any name; of ``Any``, what they hold is left to whoever reads it) and unions of these.
+    ``Literal``, ``None``, tuples (from lists; one number stands for a list of one), dataclasses (from sections),
+    mappings from text (from sections with keys of any name; of ``Any``, what they hold is left to whoever reads it)
+    and unions of these.
 
     Args:
         cls: a dataclass.
@@ -128,10 +129,17 @@ def _fit(value: Any, hint: Any, path: str) -> Any:
                 return {str(key): _fit(below, each, _join(path, str(key))) for key, below in value.items()}
         elif _is_a(value, option):
             return _with_tuples(value)
+        elif _takes_one(option) and _is_a(value, get_args(option)[0]):
+            return (value,)
     wanted = " or ".join(_describe(option) for option in options)
     shown = "null" if value is None else value
     as_text = f"; as a text: {quoted(path, str(shown))}" if str in options and isinstance(value, int | float) else ""
     raise UserInputError(f"{path}={shown} must be {wanted}{as_text}")
+
+
+def _takes_one(hint: Any) -> bool:
+    """Tell whether a value is a list of numbers of any length, for which one alone may be written without brackets."""
+    return get_origin(hint) is tuple and get_args(hint)[0] in (int, float) and get_args(hint)[-1] is Ellipsis
 
 
 def _with_tuples(value: Any) -> Any:
@@ -169,5 +177,6 @@ def _describe(hint: Any) -> str:
         if get_origin(args[0]) is tuple:
             return f"a list of lists in brackets, each {_describe(args[0]).removesuffix(' in brackets')}"
         number = "" if args[-1] is Ellipsis else f"{len(args)} "
-        return f"a list of {number}{_PLURALS[args[0]]} in brackets"
+        alone = f"{_NAMES[args[0]]} or " if _takes_one(hint) else ""
+        return f"{alone}a list of {number}{_PLURALS[args[0]]} in brackets"
     return _NAMES.get(hint, "a section with keys of its own")

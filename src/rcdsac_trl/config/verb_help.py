@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from omegaconf import OmegaConf
 
-from rcdsac_trl.config.compose import choices, compose
+from rcdsac_trl.config.compose import choices, compose, offered
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.verbs import VERBS
 
@@ -49,7 +49,7 @@ def verb_help(verb: str, overrides: Sequence[str] = ()) -> str:
     for example, does in described.examples.items():
         lines += [f"  rcdsac-trl {verb} {example}", f"{_INDENT}{does}"]
     own = (Explained(name, None, comment) for name, comment in described.groups.items())
-    groups = [line for group in own for line in _groups([group])]
+    groups = [line for group in own for line in _groups(verb, [group])]
     groups += _groups_of(path)
     if groups:
         lines += ["", "Groups, chosen by <group>=<name>:", *groups]
@@ -79,13 +79,13 @@ def list_of_verbs() -> str:
 def _groups_of(path: Path) -> list[str]:
     found = [explained for explained in explained_defaults(path) if choices(explained.name)]
     alike = groupby(found, key=lambda group: group.comment)
-    return [line for _, groups in alike for line in _groups(list(groups))]
+    return [line for _, groups in alike for line in _groups(path.stem, list(groups))]
 
 
-def _groups(groups: Sequence[Explained]) -> Iterator[str]:
+def _groups(root: str, groups: Sequence[Explained]) -> Iterator[str]:
     """Yield what there is to choose in groups that share a comment, and the comment."""
     for group in groups:
-        options = choices(group.name.lstrip("+"))
+        options = offered(root, group.name.lstrip("+"))
         named = [f"{option} (default)" if option == group.value else option for option in options]
         yield from _wrapped(f"{group.name}: {', '.join(named)}", "  ", _INDENT)
     yield from _wrapped(groups[0].comment, _INDENT, _INDENT)

@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         bridge = bridge_of(args)
     except UserInputError as error:
-        print(error, file=sys.stderr)
+        print(f"rcdsac_trl: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     drive(bridge)
 

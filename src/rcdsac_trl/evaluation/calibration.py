@@ -57,18 +57,8 @@ def make_calibration(cfg: DictConfig) -> MeasuredRun:
         )
     named = named_agent(settings.run, settings.checkpoint, half_precision=settings.half_precision)
     trained = named.settings
-    if trained.algo.critic != "quantile":
-        raise UserInputError(
-            f"run={settings.run} has {trained.algo.critic} critics, which predict no quantiles: name an agent of "
-            "another row"
-        )
+    conditions = settings.conditions_of(trained)
     settings.check_missing(trained.learner.gamma, trained.task.episode_steps)
-    conditions = trained.algo.conditions(settings.beta, None)
-    if settings.cross_evaluate and len(conditions) < 2:
-        raise UserInputError(
-            f"cross_evaluate=true holds values of beta against each other, and {settings.run} is asked for one: give "
-            "two or more to a risk-conditioned agent, such as beta=[0.25,1], or leave cross_evaluate out"
-        )
     named.check()
     processes = resolve_processes(settings.num_workers, settings.num_maps)
     make, findings = (_as_driven if settings.as_driven else _branched)(settings, named, conditions, max(1, processes))

@@ -1,7 +1,7 @@
 """Evaluation: the same maps, starts and goals for every agent, its mean actions or its choice, one row an episode."""
 
 from collections.abc import Generator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -111,7 +111,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: Chose
     conditions = settings.conditions_of(trained)
     return EvaluationSpec(
         trained=trained,
-        world=_evaluation_world(settings, trained, chosen, len(conditions)),
+        world=_evaluation_world(settings, chosen, len(conditions)),
         conditions=conditions,
         split=settings.split,
         seed=settings.seed,
@@ -189,25 +189,12 @@ def _findings(rows: Rows) -> Findings:
     )
 
 
-def _evaluation_world(
-    settings: EvaluationSettings, trained: TrainingSettings, chosen: ChosenWorld, num_conditions: int
-) -> WorldSettings:
-    sensor = chosen.sensor
-    if settings.run is None:
-        sensor = replace(sensor, memory_s=0.0)  # baselines do not read what is remembered
-    # Who chooses the sensor's name alone chooses no memory.
-    elif sensor.name == trained.sensor.name and sensor.memory_s in (0.0, trained.sensor.memory_s):
-        sensor = trained.sensor
-    else:
-        raise UserInputError(
-            f"sensor={sensor.name} sensor.memory_s={sensor.memory_s:g} does not fit: {settings.run} was trained with "
-            f"sensor={trained.sensor.name} sensor.memory_s={trained.sensor.memory_s:g}, leave both out"
-        )
+def _evaluation_world(settings: EvaluationSettings, chosen: ChosenWorld, num_conditions: int) -> WorldSettings:
     return WorldSettings(
         map_settings=with_digests(chosen.maps),
         task=chosen.task,
-        sensor=sensor.name,
-        memory_s=sensor.memory_s,
+        sensor=chosen.sensor.name,
+        memory_s=chosen.sensor.memory_s,
         num_agents=settings.num_episodes * num_conditions,
         num_workers=0,  # a process drives whole maps
         gui=settings.gui,

@@ -86,7 +86,7 @@ def make_verification(cfg: DictConfig) -> Verification:
 
 
 def _claim(name: str, weights: Weights, settings: VerificationSettings, out: Path) -> Claim:
-    folder = find_weights(name)
+    folder = find_weights(name, takes_runs=False)
     assert weights.measured is not None
     measured = weights.measured
     size = f"seed{settings.seed}-{settings.num_maps}x{settings.num_episodes}"

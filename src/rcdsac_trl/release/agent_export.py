@@ -9,12 +9,12 @@ from rcdsac_trl.config.evaluation_settings import ExportSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy.export.exported import LIMIT, betas_of, check_extra, differences, export_agent
 from rcdsac_trl.deploy.policy.weights import Weights, packed
-from rcdsac_trl.errors import FaultError, UserInputError
+from rcdsac_trl.errors import FaultError
 from rcdsac_trl.release.named_agent import RunAgent, named_agent
 from rcdsac_trl.release.quantile_offsets import with_offsets
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.progress import Work
-from rcdsac_trl.system.resources import check_writable
+from rcdsac_trl.system.resources import check_empty
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,5 @@ def make_export(cfg: DictConfig) -> Export:
     if isinstance(agent, RunAgent):
         weights = with_offsets(weights, agent.folder, agent.checkpoint)
     out = agent.out / "export" / agent.stem if settings.out is None else Path(settings.out)
-    check_writable(out)
-    if out.is_dir() and any(out.iterdir()):
-        raise UserInputError(f"out={out} is not empty: choose another folder, or remove what is there")
+    check_empty(out)
     return Export(weights, out, settings.num_quantiles, agent.training)

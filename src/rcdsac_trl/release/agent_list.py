@@ -113,7 +113,7 @@ def make_agent_list(cfg: DictConfig) -> AgentList:
     """
     # As `run_config.read_config` does, which knows all of a training and takes as long to import as all else here.
     settings = read(AgentsSettings, OmegaConf.to_container(cfg, resolve=True))  # type: ignore[arg-type]
-    found = {name: find_weights(name) for name in settings.agents} or shipped_agents()
+    found = {name: find_weights(name, takes_runs=False) for name in settings.agents} or shipped_agents()
     agents, refused = [], {}
     for name, folder in found.items():
         try:

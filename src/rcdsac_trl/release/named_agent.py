@@ -278,18 +278,7 @@ def named_agent(named: str | Path, checkpoint: Name | None = None, *, half_preci
     Raises:
         UserInputError: if there is no such agent, or its weights cannot be read.
     """
-    found = find_agent(named)
+    found = find_agent(named, checkpoint, half_precision=half_precision)
     if found.is_run:
         return RunAgent(found.path, "best" if checkpoint is None else checkpoint, half_precision)
-    if half_precision:
-        raise UserInputError(
-            f"half_precision=true rounds the agent of a run, and run={named} is one that has been written: leave it out"
-        )
-    weights = read_weights(found.path)
-    own = weights.config.provenance.get("checkpoint")
-    if checkpoint not in (None, own):
-        raise UserInputError(
-            f"checkpoint={checkpoint} chooses among those of a run, and run={named} is one agent, of checkpoint "
-            f"{own}: leave it out"
-        )
-    return ExportedAgent(found.path, weights)
+    return ExportedAgent(found.path, read_weights(found.path))

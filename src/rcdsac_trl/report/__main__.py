@@ -2,23 +2,25 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
 from rcdsac_trl.cli import Command
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.report.evaluation_folders import find_evaluations, is_course
 from rcdsac_trl.report.folder import check_report_folder
-from rcdsac_trl.report.read import read_episodes
-from rcdsac_trl.report.read_course import is_course, read_courses
-from rcdsac_trl.report.results import Results
 from rcdsac_trl.system.progress import Work
+
+if TYPE_CHECKING:
+    from rcdsac_trl.report.results import Results
 
 
 @dataclass(frozen=True)
 class Report:
     """A report that is about to be written: of what, and where."""
 
-    results: Results
+    results: "Results"
     out: Path
 
     def run(self) -> None:
@@ -49,6 +51,12 @@ def make_report(cfg: DictConfig) -> Report:
         raise UserInputError(
             f"{courses[0]} holds drives over the office course, whose table is table.md in it: name evaluations, too"
         )
+    find_evaluations(evaluated)
+    # Imported here: what is wrong with the folders does not wait for pandas and Matplotlib.
+    from rcdsac_trl.report.read import read_episodes
+    from rcdsac_trl.report.read_course import read_courses
+    from rcdsac_trl.report.results import Results
+
     return Report(
         Results(read_episodes(evaluated), evaluated, read_courses(courses) if courses else None),
         out,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from rcdsac_trl.report.evaluation_folders import BARN
 from rcdsac_trl.report.evaluation_summary import summarised
-from rcdsac_trl.report.read import BARN
 from rcdsac_trl.report.statistics import Interval, bootstrap
 
 METRICS = ("success", "collision", "timeout", "time_s", "score", "later_score")

@@ -8,13 +8,13 @@ import pandas as pd
 from rcdsac_trl.report.collision_report import ALL, THINGS, write_collisions
 from rcdsac_trl.report.read import TOLD, Evaluation, read_evaluation
 
-# What is shown of an episode, how its mean and spread are written, and what stands above them.
+# What is shown of an episode, how its numbers are written, and what stands above them.
 _COLUMNS = (
-    ("collisions", "{:.2f} ± {:.2f}", "collisions"),
-    ("reward", "{:.0f} ± {:.0f}", "reward"),
-    ("goals", "{:.2f} ± {:.2f}", "goals"),
-    ("mean_speed_m_per_s", "{:.2f} ± {:.2f}", "speed, m/s"),
-    ("contact_fraction", "{:.1%} ± {:.1%}", "in contact"),
+    ("collisions", ".2f", "collisions"),
+    ("reward", ".0f", "reward"),
+    ("goals", ".2f", "goals"),
+    ("mean_speed_m_per_s", ".2f", "speed, m/s"),
+    ("contact_fraction", ".1%", "in contact"),
 )
 
 
@@ -32,7 +32,7 @@ def _table(evaluation: Evaluation) -> list[str]:
     rows = [
         [
             _named(dict(zip(by, values, strict=True))) or told["agent"],
-            *(form.format(of[key].mean(), of[key].std(ddof=0)) for key, form, _ in _COLUMNS),
+            *(_with_spread(of[key], form) for key, form, _ in _COLUMNS),
             f"{(of['collisions'] == 0).mean():.0%}",
         ]
         for values, of in groups
@@ -43,6 +43,11 @@ def _table(evaluation: Evaluation) -> list[str]:
         f"{driven} of {told['task']['episode_steps']} steps; mean ± standard deviation of an episode:",
         *_aligned([heading, *rows]),
     ]
+
+
+def _with_spread(values: pd.Series, form: str) -> str:
+    """Write mean and standard deviation, which one value does not have."""
+    return f"{values.mean():{form}} ± {format(values.std(ddof=0), form) if len(values) > 1 else '–'}"
 
 
 def _named(condition: dict[str, object]) -> str:

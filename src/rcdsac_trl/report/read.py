@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,11 +12,9 @@ import numpy as np
 import pandas as pd
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.report.evaluation_folders import DESCRIPTION, find_evaluations
 from rcdsac_trl.report.statistics import Array
 
-DESCRIPTION = "evaluation.json"
-BARN = "barn.json"
-"""The same of runs through BARN's worlds."""
 COLLISIONS = "collisions.csv"
 TOLD = ("beta", "collision_weight", "beta_controller")
 """Columns that say what an agent was told, as far as an evaluation has them."""
@@ -81,31 +78,6 @@ class Evaluation:
     def protocol(self) -> dict[str, Any]:
         """What decides which maps, starts, goals and movers were met, and under which rules."""
         return {key: self.described[key] for key in _PROTOCOL}
-
-
-def find_evaluations(folders: Sequence[Path]) -> list[Path]:
-    """Return the evaluations among and in some folders.
-
-    Args:
-        folders: of evaluations, or of runs, whose ``evaluation/`` holds some.
-
-    Raises:
-        UserInputError: for a folder that is not there, or has none.
-    """
-    found: list[Path] = []
-    for folder in folders:
-        if not os.path.isdir(folder):  # false for a name that is too long, too
-            raise UserInputError(f"there is no folder {folder}: name runs, or evaluations of them")
-        inside = [folder] if (folder / DESCRIPTION).is_file() else []
-        inside += sorted(path.parent for path in folder.glob(f"evaluation/*/{DESCRIPTION}"))
-        if not inside and (folder / BARN).is_file():
-            raise UserInputError(
-                f"{folder} holds runs through BARN's worlds, which its summary.csv sums up: name evaluations on maps"
-            )
-        if not inside:
-            raise UserInputError(f"{folder} holds no {DESCRIPTION}: evaluate it first, or name another folder")
-        found += [path for path in inside if path not in found]
-    return found
 
 
 def read_evaluation(folder: Path) -> Evaluation:
@@ -187,14 +159,12 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
     """Read evaluations that can be compared.
 
     Args:
-        folders: as for :func:`find_evaluations`.
+        folders: as for :func:`~rcdsac_trl.report.evaluation_folders.find_evaluations`.
 
     Raises:
         UserInputError: if there are none, if maps, starts, goals or rules differ, if training seeds of one agent act
             differently, or if two hold the same.
     """
-    if not folders:
-        raise UserInputError("name what to report on: runs=[<folder>,...] of runs or of their evaluations")
     evaluations = [read_evaluation(folder) for folder in find_evaluations(folders)]
     _check_same_maps(evaluations)
     _check_same_acting(evaluations)

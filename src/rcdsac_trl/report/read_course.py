@@ -7,17 +7,12 @@ from pathlib import Path
 import pandas as pd
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.report.evaluation_folders import COURSE
 
-COURSE = "course.json"
 # Who drove, and what the version of the code was called, may differ; all else decides what they met.
 _MAY_DIFFER = ("entries", "agents", "commit")
 _WHO = ["run", "agent", "beta"]
 _RUN = ["direction", "repetition"]
-
-
-def is_course(folder: Path) -> bool:
-    """Say whether ``course`` wrote a folder."""
-    return (folder / COURSE).is_file()
 
 
 def read_courses(folders: Sequence[Path]) -> pd.DataFrame:

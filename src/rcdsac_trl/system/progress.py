@@ -16,8 +16,12 @@ SILENCE_S = 10.0
 """Nothing is silent for longer."""
 # After so long a first guess is worth something.
 _FORETOLD_S = 3.0
-# And after this share of the work: the first steps may wait for a compiler.
-_FORETOLD_SHARE = 0.002
+# The first steps may wait for a compiler: the pace is measured from this share of the work on, and told from the other.
+_MEASURED_SHARE = 0.01
+_FORETOLD_SHARE = 0.05
+
+# What a program does while it has no work to tell of.
+_BEFORE_WORK = ": it imports and reads, and the first call after an installation compiles"
 
 Watch = Callable[[int], None]
 """Is told, again and again, how many steps are done so far."""
@@ -48,7 +52,7 @@ class Work:
         self._unit = unit
         self._reached = 0.0
         self._foretold = False
-        self._began: tuple[float, float] | None = None  # when the first part was done, and how much that was
+        self._began: tuple[float, float] | None = None  # when the first share was done, and how much that was
 
     def __enter__(self) -> Self:
         """Say what begins."""
@@ -65,7 +69,7 @@ class Work:
     def reach(self, units: float) -> None:
         """Take note of how many units are done, the parts of those under way included; it may be a guess."""
         self._reached = max(self._reached, min(units, self._total))
-        if self._began is None and self._reached > 0.0:
+        if self._began is None and self._reached >= _MEASURED_SHARE * self._total:
             self._began = time.monotonic(), self._reached
         if self._foretold or self._began is None or time.monotonic() - self._began[0] < _FORETOLD_S:
             return
@@ -87,7 +91,7 @@ class Work:
 
     def left_s(self) -> float | None:
         """Guess how long the rest will take, s; None where nobody knows yet."""
-        if self._began is None or self._reached - self._began[1] < _FORETOLD_SHARE * self._total:
+        if self._began is None or self._reached < _FORETOLD_SHARE * self._total or self._reached == self._began[1]:
             return None
         pace_s = (time.monotonic() - self._began[0]) / (self._reached - self._began[1])
         return pace_s * (self._total - self._reached)
@@ -131,12 +135,14 @@ def never_silent(silence_s: float = SILENCE_S) -> Iterator[None]:
     began_s = time.monotonic()
 
     def tell() -> None:
+        what = _BEFORE_WORK
         while not over.wait(silence_s):
             how_long = f"at work for {duration(time.monotonic() - began_s)}"
             if _under_way:
                 _under_way[-1].tell(how_long)
             else:
-                print(f"rcdsac_trl: {how_long}", file=sys.stderr)
+                print(f"rcdsac_trl: {how_long}{what}", file=sys.stderr)
+                what = ""  # said once
 
     teller = threading.Thread(target=tell, daemon=True)
     teller.start()

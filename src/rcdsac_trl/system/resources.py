@@ -86,6 +86,17 @@ def check_out(folder: Path) -> None:
     check_writable(folder)
 
 
+def check_empty(out: Path) -> None:
+    """Refuse what cannot be the folder ``out`` of files that are to lie there alone.
+
+    Raises:
+        UserInputError: naming it.
+    """
+    check_out(out)
+    if out.is_dir() and any(out.iterdir()):
+        raise UserInputError(f"out={out} is not empty: choose another folder, or remove what is there")
+
+
 def check_picture(out: Path) -> None:
     """Refuse what is no PNG file, or cannot be written.
 

@@ -8,12 +8,13 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.config.command_line import folder_of, key_of
+from rcdsac_trl.config.command_line import assigned, folder_of, key_of
 from rcdsac_trl.config.compose import compose, output_folder
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import CHECKPOINTS, CONFIG_NAME, settings_of_new_run, settings_of_run
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage.checkpoint_record import newest
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.run_folder import MANIFEST_NAME, has_begun
 
 AUTO = "auto"
@@ -97,9 +98,13 @@ def _check_overrides(folder: Path, overrides: list[str]) -> None:
         if key == "hydra.run.dir" and folder_of(override).resolve() == folder.resolve():
             continue
         if key.startswith("hydra") or _changes(own, override):
+            new = "start a new run without resume"
+            if key == "schedule.iterations":
+                more = f"{program()} train {assigned('init', str(folder))} schedule.iterations=<how many more>"
+                new = f"for more iterations begin a new run with its agent: {more}"
             raise UserInputError(
                 f"{override} is not what {folder} was started with, and resume continues a run as it was: leave it "
-                "out, or start a new run without resume"
+                f"out, or {new}"
             )
 
 

@@ -8,12 +8,14 @@ from dataclasses import replace
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
+from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.schedule import Schedule
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.rollout.episode_collectors import EpisodeCollector
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint import Checkpoints
 from rcdsac_trl.storage.checkpoint_record import Progress
+from rcdsac_trl.system.invocation import program
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.system.resources import fault_sentence
 from rcdsac_trl.training.learner import Learner
@@ -220,4 +222,4 @@ class Trainer:
 def saved_sentence(checkpoints: Checkpoints, log: RunLog) -> str:
     """Say what is saved of a run, and how to go on from there."""
     saved = checkpoints.saved_iterations or 0
-    return f"{saved} iterations are saved, resume={log.folder} continues there"
+    return f"{saved} iterations are saved, continue: {program()} train {assigned('resume', str(log.folder))}"

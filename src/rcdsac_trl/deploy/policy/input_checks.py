@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.deploy.sensors.arrays import masked, numbers_of
+from rcdsac_trl.deploy.sensors.arrays import is_plural, masked, numbers_of
 from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, unsaid_readings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MIN_RANGE_M, WAYPOINT_DISTANCE_LIMITS_M
@@ -262,5 +262,6 @@ def velocity_of(velocity: Any, robot: RobotSettings = PAPER) -> tuple[float, flo
 def _array(value: Any, shape: tuple[int, ...] | None, name: str) -> NDArray[np.float64]:
     array = numbers_of(value, name)
     if shape is not None and array.shape != shape:
-        raise BadInputError(f"{name} have shape {list(array.shape)}: give {list(shape)}")
+        has = "have" if is_plural(name) else "has"
+        raise BadInputError(f"{name} {has} shape {list(array.shape)}: give {list(shape)}")
     return array

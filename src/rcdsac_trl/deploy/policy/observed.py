@@ -37,7 +37,7 @@ def observed(observation: Any, config: AgentConfig) -> Observed:
     """Read an observation, a dict or a TensorDict with its keys.
 
     Raises:
-        UserInputError: if it is none, lacks something, or is of another sensor than the agent's.
+        UserInputError: if it is none, lacks something, is not finite, or is of another sensor than the agent's.
     """
     sizes = {_RANGE: NUM_BINS} | vector_observations(config.memory_s)
     arrays = {key: _array(observation, key, size) for key, size in sizes.items()}
@@ -70,4 +70,6 @@ def _array(observation: Any, key: str, size: int) -> NDArray[np.float32]:
     array = numbers_of(value, key).astype(np.float32)
     if array.shape[-1:] != (size,):
         raise UserInputError(f"{key} has shape {array.shape}, and ends in {size} numbers in an observation: give that")
+    if (strange := array[~np.isfinite(array)]).size:
+        raise UserInputError(f"the observation's {key!r} holds {strange[0]}: give finite numbers, as environments do")
     return array

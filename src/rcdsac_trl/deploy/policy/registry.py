@@ -115,8 +115,12 @@ def is_shipped(folder: Path) -> bool:
     return folder.resolve().parent in [place.resolve() for place in places()]
 
 
-def find_weights(name_or_folder: str | Path) -> Path:
+def find_weights(name_or_folder: str | Path, *, takes_runs: bool = True) -> Path:
     """Return the weights folder of that path, or of the agent of that name.
+
+    Args:
+        name_or_folder: what was typed.
+        takes_runs: whether whoever asks would take a run folder, too, so that one is worth offering.
 
     Raises:
         UserInputError: if there is neither; the sentence says what was probably meant, and how to get it.
@@ -127,18 +131,34 @@ def find_weights(name_or_folder: str | Path) -> Path:
     agents = shipped_agents()
     if (name := str(name_or_folder)) in agents:
         return agents[name]
-    others = f"`{program()} agents` lists what there is; or name a run folder, or one that `export` wrote"
+    folders = "a run folder, or one that `export` wrote" if takes_runs else "a folder that `export` wrote"
+    others = f"`{program()} agents` lists what there is; or name {folders}"
     if os.path.isdir(folder):
-        raise UserInputError(f"{folder} holds neither checkpoints nor {CONFIG_NAME}: {others}")
+        lacks = f"neither checkpoints nor {CONFIG_NAME}" if takes_runs else f"no {CONFIG_NAME}"
+        raise UserInputError(f"{folder} holds {lacks}: {others}")
     if name in table_names():
         looked = ", ".join(from_here(place) for place in places()) or "no folder"
         raise UserInputError(
             f"agent {name} is not here (looked into {looked}): let {WEIGHTS_VARIABLE} name the folder weights/ of a "
             f"checkout that has it, or train it, {rebuilding_command(name)}"
         )
-    near = [  # one that is here before one that would have to be trained
-        *difflib.get_close_matches(name, sorted(agents), n=1),
-        *difflib.get_close_matches(name, sorted(table_names()), n=1),
-    ]
-    meant = f"did you mean {near[0]}? " if near else ""
+    near = nearest_agent(name)
+    meant = "" if near is None else f"did you mean {near}? "
     raise UserInputError(f"there is no agent {name!r}: {meant}{others}")
+
+
+def nearest_agent(typed: str) -> str | None:
+    """Return the agent that was probably meant; None where none is like it.
+
+    What begins as it was typed comes before what is spelt alike, one that is here before one that would have to be
+    trained, and the paper's first sensor, narrow, before others.
+
+    Raises:
+        UserInputError: as :func:`places`.
+    """
+    here = shipped_names()
+    for names in (here, table_names()):
+        if typed and (begun := [name for name in names if name.startswith(typed)]):
+            return min(begun, key=lambda name: (not name.endswith(f"-{TABLE_SENSORS[0]}"), len(name)))
+    near = [match for names in (here, sorted(table_names())) for match in difflib.get_close_matches(typed, names, n=1)]
+    return near[0] if near else None

@@ -18,11 +18,11 @@ def numbers_of(value: Any, name: str) -> NDArray[np.float64]:
 
     Args:
         value: an array, nested lists, a tensor of torch (with a gradient or without), or what else NumPy can read.
-        name: what the numbers are, in the plural, for the sentence of a refusal.
+        name: what the numbers are, for the sentence of a refusal.
 
     Raises:
-        UserInputError: if they are none: texts, objects, booleans, complex numbers, numbers too large for float64, or
-            an object that cannot be read; or if they carry a unit, which the array would lose.
+        UserInputError: if they are missing, or none: texts, objects, booleans, complex numbers, numbers too large for
+            float64, or an object that cannot be read; or if they carry a unit, which the array would lose.
 
     Example:
         >>> numbers_of(np.ma.array([1, 2], mask=[False, True]), "ranges").tolist()
@@ -30,19 +30,32 @@ def numbers_of(value: Any, name: str) -> NDArray[np.float64]:
     """
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
+    are = "are" if is_plural(name) else "is"
+    if value is None:
+        raise UserInputError(f"{name} {are} missing: give numbers")
     try:
         _refuse_masses(value, name)
         array = _array(value, name)
         _refuse_masses(array, name)
         if array.dtype.kind not in "fiu":
-            raise UserInputError(f"{name} are not numbers but {array.dtype}: give floats")
+            raise UserInputError(f"{name} {are} not numbers but {array.dtype}: give floats")
         with np.errstate(over="raise"):  # else what is too large becomes inf, which means that nothing is there
             floats: NDArray[np.float64] = array.astype(np.float64, copy=False)
         return floats.filled(np.nan) if isinstance(floats, np.ma.MaskedArray) else np.asarray(floats)
     except UserInputError:
         raise
     except Exception as error:  # what an object does when it is read is not ours to know
-        raise UserInputError(f"{name} are not numbers: a {type(value).__name__} gives {described(error)}") from error
+        raise UserInputError(f"{name} {are} not numbers: a {type(value).__name__} gives {described(error)}") from error
+
+
+def is_plural(name: str) -> bool:
+    """Tell which verb a name takes in a sentence.
+
+    Example:
+        >>> is_plural("ranges"), is_plural("velocity")
+        (True, False)
+    """
+    return name.endswith("s")
 
 
 def masked(value: Any) -> NDArray[np.bool_] | None:

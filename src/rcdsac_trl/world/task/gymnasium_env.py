@@ -94,6 +94,8 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         """Begin an episode; see the class for ``seed`` and ``options``."""
         if not isinstance(options, Mapping | None):
             raise UserInputError(f"options={options!r} are no dictionary: give {{'episode': <number>}}")
+        if strange := next((key for key in options or () if key != "episode"), None):
+            raise UserInputError(f"a reset has no option {strange!r}: give {{'episode': <number>}}, or none")
         root = seed
         if root is None and not self._has_begun:
             root = self._drawn_seed() if self._seed is None else self._seed

@@ -97,48 +97,50 @@ class TaskSettings:
         """Refuse what is outside the limits."""
         for name in ("motor_steps", "odometry_noise_std", "pose_noise_std"):
             if not isinstance(getattr(self, name), Sequence):
-                raise UserInputError(f"{name}={getattr(self, name)} must be a list of numbers, such as [6, 7, 8]")
+                raise UserInputError(f"task.{name}={getattr(self, name)} must be a list of numbers, such as [6, 7, 8]")
         # Hydra hands lists over; a frozen value keeps tuples.
         object.__setattr__(self, "motor_steps", tuple(self.motor_steps))
         object.__setattr__(self, "odometry_noise_std", tuple(self.odometry_noise_std))
         object.__setattr__(self, "pose_noise_std", tuple(self.pose_noise_std))
         if self.version != RULES_VERSION:
             raise UserInputError(
-                f"task version is {self.version!r} but this is version {RULES_VERSION} of the rules; "
-                f"set version to {RULES_VERSION}"
+                f"task.version={self.version!r} is not the version of the rules here: set it to {RULES_VERSION}"
             )
         if self.episode_steps < 1:
-            raise UserInputError(f"episode_steps={self.episode_steps} must be at least 1")
+            raise UserInputError(f"task.episode_steps={self.episode_steps} must be at least 1")
         modes = get_args(CollisionPenaltyMode)
         if self.collision_penalty_mode not in modes:
             raise UserInputError(
-                f"collision_penalty_mode={self.collision_penalty_mode!r} does not exist; choose {' or '.join(modes)}"
+                f"task.collision_penalty_mode={self.collision_penalty_mode!r} does not exist: "
+                f"choose {' or '.join(modes)}"
             )
         for name in ("waypoint_radius_m", "goal_radius_m", "min_path_m"):
             if not 0.0 < getattr(self, name) < math.inf:
-                raise UserInputError(f"{name}={getattr(self, name)} must be a positive number of metres")
+                raise UserInputError(f"task.{name}={getattr(self, name)} must be a positive number of metres")
         if not self.motor_steps or any(n != int(n) or n < 1 for n in self.motor_steps):
             raise UserInputError(
-                f"motor_steps={list(self.motor_steps)} must be whole numbers of at least 1, such as [6, 7, 8]"
+                f"task.motor_steps={list(self.motor_steps)} must be whole numbers of at least 1, such as [6, 7, 8]"
             )
         if not 0.0 <= self.range_noise_std_m < math.inf:
-            raise UserInputError(f"range_noise_std_m={self.range_noise_std_m} must be 0 or more")
+            raise UserInputError(f"task.range_noise_std_m={self.range_noise_std_m} must be 0 or more")
         if not 0.0 <= self.range_dropout <= 1.0:
-            raise UserInputError(f"range_dropout={self.range_dropout} is a probability; give 0 to 1")
+            raise UserInputError(f"task.range_dropout={self.range_dropout} is a probability; give 0 to 1")
         for name, units in (("odometry_noise_std", "m/s and rad/s"), ("pose_noise_std", "m and rad")):
             pair = getattr(self, name)
             if len(pair) != 2 or not all(0.0 <= s < math.inf for s in pair):
-                raise UserInputError(f"{name}={list(pair)} must be two numbers of 0 or more: {units}")
+                raise UserInputError(f"task.{name}={list(pair)} must be two numbers of 0 or more: {units}")
         if not 0.0 <= self.motor_slowness < 1.0:
-            raise UserInputError(f"motor_slowness={self.motor_slowness} is a share of the speed: give 0 to below 1")
+            raise UserInputError(
+                f"task.motor_slowness={self.motor_slowness} is a share of the speed: give 0 to below 1"
+            )
         if not 0.0 <= self.stop_zone_share <= 1.0:
-            raise UserInputError(f"stop_zone_share={self.stop_zone_share} is a share of the episodes; give 0 to 1")
+            raise UserInputError(f"task.stop_zone_share={self.stop_zone_share} is a share of the episodes; give 0 to 1")
         if not 0.0 <= self.stop_zone_margin_m <= 1.0:
-            raise UserInputError(f"stop_zone_margin_m={self.stop_zone_margin_m} must be 0 to 1 metres")
+            raise UserInputError(f"task.stop_zone_margin_m={self.stop_zone_margin_m} must be 0 to 1 metres")
         if self.disturbances not in ("fixed", "drawn"):
-            raise UserInputError(f"disturbances={self.disturbances!r} does not exist: choose fixed or drawn")
+            raise UserInputError(f"task.disturbances={self.disturbances!r} does not exist: choose fixed or drawn")
         if self.action_delay_steps < 0:
-            raise UserInputError(f"action_delay_steps={self.action_delay_steps} must be 0 or more")
+            raise UserInputError(f"task.action_delay_steps={self.action_delay_steps} must be 0 or more")
 
 
 REWARD_COMPONENTS = ("base", "goal", "waypoint", "angular", "collision")

@@ -1,16 +1,19 @@
 """Our own maps as JSON: what ``Map.to_json`` writes, or what someone wrote by hand."""
 
+import difflib
 import json
 import math
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.world.maps.files.floor_plan import FloorPlan
-from rcdsac_trl.world.maps.shapes import FORMAT_VERSION, map_of_values
+from rcdsac_trl.world.maps.shapes import FORMAT_VERSION, Map, map_of_values
 
 # What a file by hand may leave out.
 _DEFAULTS: dict[str, Any] = {"format": FORMAT_VERSION, "boxes": [], "cylinders": [], "movers": []}
+_KEYS = ("format", "walls", "wall_thickness_m", *(field.name for field in fields(Map)))
 _BOX = {"yaw": 0.0, "mapped": True}
 _CYLINDER = {"mapped": True}
 _WALL_M = 0.1
@@ -34,6 +37,7 @@ def read_map_json(path: Path, *, mapped: bool) -> FloorPlan:
         values = json.loads(path.read_text(encoding="utf-8-sig"))
         if not isinstance(values, dict):
             raise ValueError("it holds no keys")
+        _check_keys(values)
         extent_m = _extent_m(values["size_m"])
         map_ = map_of_values(_completed(values, path.stem, extent_m, mapped))
     except KeyError as error:
@@ -51,6 +55,14 @@ def read_map_json(path: Path, *, mapped: bool) -> FloorPlan:
         map_.start,
         map_.goal,
     )
+
+
+def _check_keys(values: dict[str, Any]) -> None:
+    if strange := next((key for key in values if key not in _KEYS), None):
+        near = difflib.get_close_matches(strange, _KEYS, n=1)
+        raise ValueError(
+            f"there is no key {strange}" + (f": did you mean {near[0]}?" if near else f", a map has {', '.join(_KEYS)}")
+        )
 
 
 def _extent_m(size_m: Any) -> tuple[float, float]:
