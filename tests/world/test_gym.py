@@ -61,6 +61,7 @@ def test_the_id_is_registered_when_gymnasium_comes_later_and_costs_nothing_befor
         "assert not {'torch', 'gymnasium', 'pybullet'} & set(sys.modules)\n"
         "import importlib; importlib.reload(rcdsac_trl)\n"
         "assert len(sys.meta_path) == finders\n"
+        "import importlib.util; assert importlib.util.find_spec('gymnasium')\n"  # as TorchRL asks
         "import gymnasium\n"
         f"assert gymnasium.spec({ENV_ID!r}).entry_point == 'rcdsac_trl.config.named_world:gymnasium_env'\n"
         "assert len(sys.meta_path) == finders - 1\n"

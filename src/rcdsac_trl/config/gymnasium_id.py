@@ -31,15 +31,17 @@ def _register(gymnasium: ModuleType) -> None:
 
 
 class _Register(MetaPathFinder):
-    """Finds Gymnasium once, as everybody else would, and registers the name when it has been loaded."""
+    """Finds Gymnasium as everybody else would, and registers the name when it has been loaded."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         if fullname != _GYMNASIUM:
             return None
-        sys.meta_path.remove(self)
+        place = sys.meta_path.index(self)
+        sys.meta_path.remove(self)  # while the others look
         spec = find_spec(fullname)
+        sys.meta_path.insert(place, self)  # some only ask whether it is installed
         if spec is None or spec.loader is None:
             return spec
         load = spec.loader.exec_module
@@ -47,6 +49,7 @@ class _Register(MetaPathFinder):
         def load_and_register(module: ModuleType) -> None:
             load(module)
             _register(module)
+            sys.meta_path.remove(self)
 
         spec.loader.exec_module = load_and_register  # type: ignore[method-assign]
         return spec

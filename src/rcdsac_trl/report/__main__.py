@@ -11,6 +11,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report.evaluation_folders import find_evaluations, is_course
 from rcdsac_trl.report.folder import check_report_folder
 from rcdsac_trl.system.progress import Work
+from rcdsac_trl.system.resources import check_out
 
 if TYPE_CHECKING:
     from rcdsac_trl.report.results import Results
@@ -44,6 +45,7 @@ def make_report(cfg: DictConfig) -> Report:
     named = [runs] if isinstance(runs, str) else list(runs or [])
     folders = [Path(str(run)) for run in named]
     out = Path(str(cfg.out))
+    check_out(out)
     check_report_folder(out)
     courses = [folder for folder in folders if is_course(folder)]
     evaluated = [folder for folder in folders if folder not in courses]

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.system.resources import check_out
 
 CLAIMS = "claims.md"
 """The first file that a report writes: by it its folder is known."""
@@ -22,12 +21,11 @@ _NOT_ALWAYS = (
 
 
 def check_report_folder(out: Path) -> None:
-    """Refuse a folder that cannot take a report, or holds something else.
+    """Refuse a folder that holds something else than a report.
 
     Raises:
         UserInputError: naming it.
     """
-    check_out(out)
     if out.is_dir() and not (out / CLAIMS).is_file() and any(out.iterdir()):
         raise UserInputError(f"out={out} holds something else than a report: give another folder with out=<folder>")
 
