@@ -14,7 +14,7 @@ Colors = Mapping[str, str]
 
 _STEP = 5.0
 _HEAVY = 4.0
-_BAR_PX = 54
+_BAR_PX = 70
 _ROOM = 0.05
 
 
