@@ -258,7 +258,7 @@ def test_a_real_limit_on_files_ends_a_run_in_one_sentence(tmp_path: Path, backen
     """
     run = tmp_path / "run"
 
-    def program() -> None:
+    def training() -> None:
         warnings.simplefilter("ignore")
         trainer = tiny_trainer(run, "rcdsac_pow", "checkpoint.every_iterations=1", f"logger.backends=[{backends}]")
         save = trainer.checkpoints.save
@@ -274,7 +274,7 @@ def test_a_real_limit_on_files_ends_a_run_in_one_sentence(tmp_path: Path, backen
         except TrainingError as error:
             fail(error)
 
-    ended = Forked(program, tmp_path / "said")
+    ended = Forked(training, tmp_path / "said")
     assert ended.code() == 1, ended.said
     told = (
         r"rcdsac_trl: a file became larger than this system or its limits allow \(.*File too large\): training stops "
