@@ -58,13 +58,11 @@ class Rates:
 @contextmanager
 def served() -> Iterator[str]:
     """Start ``play``, and give its address once it answers."""
-    with tempfile.TemporaryDirectory() as folder:
-        server = subprocess.Popen(
-            [sys.executable, "-m", "rcdsac_trl.play", "browser=false", "port=0"],
-            cwd=folder,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+    command = [sys.executable, "-m", "rcdsac_trl.play", "browser=false", "port=0"]
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True) as server,
+    ):
         try:
             assert server.stdout is not None
             address = re.match(r"\S+", server.stdout.readline())
@@ -73,7 +71,6 @@ def served() -> Iterator[str]:
             yield address[0]
         finally:
             server.terminate()
-            server.wait()
 
 
 def rates(page: Page, address: str, query: str, seconds: float) -> Rates:
