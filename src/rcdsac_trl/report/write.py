@@ -24,14 +24,7 @@ def write_report(results: Results, out: Path) -> None:
         UserInputError: if it holds something else.
     """
     check_report_folder(out)
-    clear_report_folder(out)
-    out.mkdir(parents=True, exist_ok=True)
     claims = as_table(results.claims)
-    (out / CLAIMS).write_text(table.markdown(claims), encoding="utf-8")
-    table.write_table(results.paper, out / "table")
-    if results.course is not None:
-        results.course.to_csv(out / "course.csv", index=False)
-        (out / "course.md").write_text(table.markdown(results.course), encoding="utf-8")
     tables = {
         "claims": claims,
         "claims_evidence": evidence(results.claims),
@@ -42,12 +35,22 @@ def write_report(results: Results, out: Path) -> None:
         "adaptive": results.adaptive,
         "collision_summary": results.causes,
     }
+    figures = _figures(results)
+    told = page(title(results), lead(results), sections(results))
+    # Only now: what an earlier report holds is not lost to one that cannot be made.
+    clear_report_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / CLAIMS).write_text(table.markdown(claims), encoding="utf-8")
+    table.write_table(results.paper, out / "table")
+    if results.course is not None:
+        results.course.to_csv(out / "course.csv", index=False)
+        (out / "course.md").write_text(table.markdown(results.course), encoding="utf-8")
     for name, values in tables.items():
         if len(values) or name not in ("adaptive", "collision_summary"):
             values.to_csv(out / f"{name}.csv", index=False, float_format="%.6g")
-    for name, figure in _figures(results).items():
+    for name, figure in figures.items():
         figure.savefig(out / f"{name}.png", dpi=130)
-    (out / "report.html").write_text(page(title(results), lead(results), sections(results)), encoding="utf-8")
+    (out / "report.html").write_text(told, encoding="utf-8")
 
 
 def _figures(results: Results) -> dict[str, Figure]:
