@@ -42,7 +42,6 @@ _COURSE_HEADINGS = (
     *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
     *("in reverse: arrived", "collisions a run", "time, s"),
 )
-_NAMES = {"mppi": "MPPI", "dwa": "DWA", "pursuit": "pure pursuit"}
 _HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goals")
 
 
@@ -154,8 +153,7 @@ def _cells(condition: Mapping[str, Any]) -> list[str]:
         for of, form in ((metrics["collisions"], ".2f"), (metrics["reward"], ".0f"))
     )
     free, goals = metrics["collision_free"]["mean"], metrics["goals"]["mean"]
-    label = _NAMES.get(condition["label"], condition["label"])
-    return [label, collisions, reward, f"{100 * free:.0f} %", f"{goals:.2f}"]
+    return [condition["label"], collisions, reward, f"{100 * free:.0f} %", f"{goals:.2f}"]
 
 
 def accelerator_table(values: Mapping[str, Any] | None) -> str:

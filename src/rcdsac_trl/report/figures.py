@@ -37,8 +37,6 @@ _MEASURES = {
     "cpw": "CPW",
     "var": "VaR",
 }
-# Of rows that the paper's table lacks.
-_NAMES = {"rcdsac_pow_wide": ("RC-DSAC (resample)", "wide pow"), "dwa": ("DWA", ""), "mppi": ("MPPI", "")}
 # What less of a metric is called, where it is counted.
 _LESS = {"collisions": "fewer", "goals": "fewer"}
 _LEARNT = ("reward", "collisions")
@@ -218,7 +216,7 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
 
 def _beside(condition: pd.Series) -> str:
     """Name a condition beside its row: the agent, and below it the setting, if there is one."""
-    name, measure = _NAMES.get(condition["agent"], called(condition["agent"]))
+    name, measure = called(condition["agent"])
     setting = setting_label(condition["beta"], condition["collision_weight"], condition["beta_controller"])
     return f"{name}\n{measure}{setting}" if measure else f"{name}{setting}"
 

@@ -17,6 +17,13 @@ from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, bootstrap
 SENSORS = ("narrow", "sparse")
 TABULATED = ("collisions", "reward")
 KEY = ["agent", "beta", "collision_weight"]
+# Name and measure of rows that the paper's table lacks.
+_BEYOND_THE_PAPER = {
+    "rcdsac_pow_wide": ("RC-DSAC (resample)", "wide pow"),
+    "mppi": ("MPPI", ""),
+    "dwa": ("DWA", ""),
+    "pursuit": ("pure pursuit", ""),
+}
 
 
 def paper_table() -> pd.DataFrame:
@@ -108,8 +115,8 @@ def row_label(agent: str) -> str:
     """Name a row as the paper does, with its measure.
 
     Example:
-        >>> row_label("rcdsac_pow"), row_label("sac"), row_label("mine")
-        ('RC-DSAC (resample) pow', 'SAC', 'mine')
+        >>> row_label("rcdsac_pow"), row_label("mppi"), row_label("mine")
+        ('RC-DSAC (resample) pow', 'MPPI', 'mine')
     """
     return " ".join(part for part in called(agent) if part)
 
@@ -120,9 +127,11 @@ def _names() -> pd.DataFrame:
 
 
 def called(agent: str) -> tuple[str, str]:
-    """Return the paper's name and risk measure of a row; its own name and no measure where the paper has none."""
+    """Return the name and risk measure of a row, the paper's where it has it; of an unknown one its own name."""
     names = _names().set_index("agent").fillna("")
-    return (str(names.at[agent, "name"]), str(names.at[agent, "psi"])) if agent in names.index else (agent, "")
+    if agent in names.index:
+        return str(names.at[agent, "name"]), str(names.at[agent, "psi"])
+    return _BEYOND_THE_PAPER.get(agent, (agent, ""))
 
 
 def _pairs(table: pd.DataFrame) -> list[tuple[str, str]]:
