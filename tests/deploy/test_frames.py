@@ -167,9 +167,9 @@ class Listener(Recorder):
 
     given: dict[str, Any]
 
-    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Any) -> Any:
-        self.given = {"ranges": ranges, "velocity": velocity, "stamps": stamps}
-        return super().act(ranges, waypoints, velocity, beta, stamps=stamps)
+    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Any, pose: Any) -> Any:
+        self.given = {"ranges": ranges, "velocity": velocity, "stamps": stamps, "pose": pose}
+        return super().act(ranges, waypoints, velocity, beta, stamps=stamps, pose=pose)
 
 
 def driver(**options: Any) -> tuple[Driver, Listener]:
@@ -191,6 +191,7 @@ def test_a_plan_in_map_is_brought_to_the_robot_by_the_newest_correction() -> Non
     assert found.command(10.0).reason is None
     assert policy.waypoints == pytest.approx(np.array([(-1.0, -8.0), (-1.0, -8.0)]))
     assert policy.given["velocity"] == (0.1, 0.0)
+    assert policy.given["pose"] == pytest.approx((1.0, 1.0, math.pi / 2))
     assert found.situation is not None
     assert found.situation.pose == pytest.approx((1.0, 1.0, math.pi / 2))
 

@@ -299,7 +299,7 @@ def test_the_node_only_uses_what_the_core_has() -> None:
             assert all(hasattr(module, alias.name) for alias in node.names)
     subscribed = [node.args[1] for node in ast.walk(tree) if isinstance(node, ast.Call) and is_subscription(node)]
     named = [ast.literal_eval(topic) for topic in subscribed if isinstance(topic, ast.Constant)]
-    assert named == ["scan", "odom", "plan", "/tf", "/tf_static", "pose"]  # dds_node's, and Nav2's
+    assert named == ["scan", "odom", "plan", "/tf", "/tf_static", "pose", "map"]  # dds_node's, and Nav2's
     driver = Driver(Policy(agent()))
     used = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     for name in (text.removeprefix("self.driver.") for text in used if text.startswith("self.driver.")):

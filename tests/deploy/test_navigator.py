@@ -43,13 +43,13 @@ def in_robot(point: tuple[float, float], pose: tuple[float, float, float]) -> tu
 def test_a_detour_leads_past_the_nearer_end_of_a_wall_and_keeps_clear() -> None:
     local_map = LocalMap(LocalMapSettings(), ALL)
     local_map.observe(seen((0.0, 0.0, 0.0)))
-    assert not is_clear(local_map, (0.0, 0.0), (3.5, 0.0), 0.25)
-    assert is_clear(local_map, (0.0, 0.0), (1.0, 0.0), 0.25)
-    corners = plan_detour(local_map, (3.5, 0.0), 0.25)
+    assert not is_clear(local_map.clearances, (0.0, 0.0), (3.5, 0.0), 0.25)
+    assert is_clear(local_map.clearances, (0.0, 0.0), (1.0, 0.0), 0.25)
+    corners = plan_detour(local_map.clearances, (0.0, 0.0), (3.5, 0.0), 0.25)
     assert corners[-1] == (3.5, 0.0)
     assert all(y < 0.0 for _, y in corners[:-1])
     # Cells of 10 cm: the discs that sensed points stand for are passed at the robot's radius, within half a cell.
-    points = local_map.points[np.isfinite(local_map.points[..., 2])][:, :2]
+    points = local_map.remembered
     for start, end in zip([(0.0, 0.0), *corners], corners, strict=False):
         assert np.hypot(*(points[:, None] - np.linspace(start, end, 50)).T).min() > 0.19
 
@@ -58,7 +58,7 @@ def test_where_nothing_leads_on_there_is_no_detour() -> None:
     walls = np.array([[1.0, -1.0, 1.0, 1.0], [-1.0, -1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, 1.0], [-1.0, -1.0, 1.0, -1.0]])
     local_map = LocalMap(LocalMapSettings(), ALL)
     local_map.observe(seen((0.0, 0.0, 0.0), walls))
-    assert plan_detour(local_map, (3.5, 0.0), 0.25) == []
+    assert plan_detour(local_map.clearances, (0.0, 0.0), (3.5, 0.0), 0.25) == []
 
 
 def test_waypoints_stay_where_the_way_is_free_or_was_blocked_for_a_moment() -> None:

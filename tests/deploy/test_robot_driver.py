@@ -74,7 +74,7 @@ class Recorder:
         self.config, self.limits = agent().config, InputLimits()
         self.waypoints: Any = None
 
-    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Any) -> Command:
+    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Any, pose: Any) -> Command:
         self.waypoints = waypoints
         return Command(0.1, 0.0, False, None)
 

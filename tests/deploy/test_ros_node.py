@@ -103,7 +103,7 @@ def ros_node(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
         },
         "rcl_interfaces.msg": {"SetParametersResult": SimpleNamespace},
         "geometry_msgs.msg": {"Twist": Twist, "TwistStamped": TwistStamped, "PoseWithCovarianceStamped": object},
-        "nav_msgs.msg": {"Odometry": object, "Path": object},
+        "nav_msgs.msg": {"OccupancyGrid": object, "Odometry": object, "Path": object},
         "sensor_msgs.msg": {"LaserScan": object, "PointCloud2": object},
         "std_msgs.msg": {"Float32MultiArray": SimpleNamespace, "String": SimpleNamespace},
         "tf2_msgs.msg": {"TFMessage": object},
@@ -186,6 +186,10 @@ def test_it_leads_around_what_blocks_the_way_where_that_is_asked_for(ros_node: A
     assert node.driver.policy.navigator.settings == NavigatorSettings(watchdog=None)
     assert driven(node).twist.linear.x != 0.0
     assert node.driver.policy._advice is not None
+    assert node.qos["map"].durability == "kept"
+    node.subscriptions["map"](None)
+    node.timers[0]()
+    assert "the map cannot be read" in node.published[-1].data
 
 
 def test_cameras_are_read_in_place_of_the_scanner(ros_node: Any) -> None:

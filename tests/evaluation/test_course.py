@@ -40,7 +40,7 @@ from rcdsac_trl.evaluation.course.course_drive import (
 from rcdsac_trl.evaluation.course.course_film import frames
 from rcdsac_trl.evaluation.course.course_run import make_course
 from rcdsac_trl.evaluation.course.entries import entries_of
-from rcdsac_trl.evaluation.course.odometry import Odometry
+from rcdsac_trl.evaluation.course.odometry import Odometry, Pose
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
 from rcdsac_trl.report.course_table import course_table, paper_course, write_course
 from rcdsac_trl.robot.range_sensor import sensor_mask
@@ -73,9 +73,11 @@ class Recorder(PursuitPilot):
         super().__init__()
         self.told: list[tuple[Any, ...]] = []
 
-    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None) -> Command:
-        self.told.append((ranges, waypoints, velocity, beta, stamps))
-        return super().act(ranges, waypoints, velocity, beta, stamps=stamps)
+    def act(
+        self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None, pose: Pose
+    ) -> Command:
+        self.told.append((ranges, waypoints, velocity, stamps, pose))
+        return super().act(ranges, waypoints, velocity, beta, stamps=stamps, pose=pose)
 
 
 # ------------------------------------------------------------------------------------------------ one run
@@ -97,7 +99,7 @@ def test_pursuit_that_knows_everything_reaches_the_end(direction: Direction) -> 
         alone = replace(OFFICE.map, movers=())
         simulation.load(alone, OFFICE.planner, start_pose(path), stream(0, "nobody"))
         while (waypoints := follower.update(simulation.pose)) is not None and steps < 1000:
-            command = pilot.act(None, waypoints, None, None, stamps=None)
+            command = pilot.act(None, waypoints, None, None, stamps=None, pose=simulation.pose)
             moved = simulation.step(command.v_m_per_s, command.omega_rad_per_s, motor_steps(steps))
             onsets, touched, steps = onsets + (moved.in_contact and not touched), moved.in_contact, steps + 1
     assert follower.reached
@@ -110,14 +112,15 @@ def test_the_pilot_is_told_what_sensors_say_and_nothing_else() -> None:
     trace = drive(pilot)
     assert len(pilot.told) == len(trace.commands) == 10
     course = course_of(OFFICE, "forward")
-    for step, (ranges, waypoints, velocity, _, stamps) in enumerate(pilot.told):
+    for step, (ranges, waypoints, velocity, stamps, pose) in enumerate(pilot.told):
         assert isinstance(ranges, Sectors)
         assert ranges.covered[sensor_mask("narrow")].all()
         assert np.array_equal(ranges.distances_m, trace.distances_m[step])
         assert stamps == Stamps(*[step * PERIOD_S] * 4)
         assert velocity == tuple(trace.velocities[step])
         # The waypoint as seen from where the robot takes itself to be.
-        x, y, yaw = trace.estimates[step]
+        assert pose == tuple(trace.estimates[step])
+        x, y, yaw = pose
         bearing = math.atan2(waypoints[0][1], waypoints[0][0]) + yaw
         seen_at = (x, y) + np.hypot(*waypoints[0]) * np.array([math.cos(bearing), math.sin(bearing)])
         assert seen_at == pytest.approx(course[1])
@@ -387,6 +390,25 @@ def test_agents_act_as_they_say_or_as_is_asked_of_them(
         assert (entry.pilot.acting.num_candidates, entry.pilot.acting.spread) == acting
 
 
+def test_a_static_layer_shows_what_the_planner_knows_the_glass_among_it(tmp_path: Path) -> None:
+    run = f"run={exported(tmp_path / 'agent')}"
+    settings = read_config(compose("course", given(tmp_path, run, "navigation.static_layer=true")), CourseSettings)
+    pilot = entries_of(settings)[0].pilot
+    assert isinstance(pilot, Policy)
+    assert pilot.navigator is not None
+    assert not pilot.navigator.settings.replan
+    assert pilot.navigator.static_layer is not None
+
+    def shown(x: float, y: float) -> bool:
+        points = pilot.navigator.static_layer.around((x, y, 0.0), 0.3)  # type: ignore[union-attr]
+        return bool((np.hypot(*points.T) < 0.1).any())
+
+    pane = next(piece for piece in OFFICE.pieces if piece.glass and not piece.solids)
+    assert shown(pane.footprint.x, pane.footprint.y)
+    unknown = [shape for shape in OFFICE.map.cylinders if not shape.mapped]
+    assert not any(shown(shape.x + shape.radius, shape.y) for shape in unknown)
+
+
 @pytest.mark.parametrize(
     ("changes", "overrides", "message"),
     [
@@ -403,6 +425,7 @@ def test_agents_act_as_they_say_or_as_is_asked_of_them(
         ({}, ["odometry.fix_weight=2"], "odometry.fix_weight=2"),
         ({}, ["out="], "out names no folder"),
         ({}, ["guard_margin_m=-0.1"], "margin_m=-0.1"),
+        ({}, ["navigation.static_layer=true", "guard_margin_m=null"], "static_layer=true changes nothing"),
     ],
 )
 def test_what_cannot_work_is_refused_before_anything_is_written(

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rcdsac_trl.config.acting_override import ActingOverride
-from rcdsac_trl.config.navigation_settings import NavigationSettings
+from rcdsac_trl.config.navigation_settings import CourseNavigationSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.checks import check_least
 from rcdsac_trl.system.processes import resolve_processes
@@ -70,7 +70,7 @@ class CourseSettings:
     baseline: Literal["pursuit"] | None
     guard_margin_m: float | None
     acting: ActingOverride
-    navigation: NavigationSettings
+    navigation: CourseNavigationSettings
     repetitions: int
     seed: int
     time_limit_s: float
@@ -94,6 +94,11 @@ class CourseSettings:
                 if values.count(value) > 1:
                     raise UserInputError(f"{key}={value} is given more than once: name every value once")
         resolve_processes(self.num_workers, 1)
+        if self.navigation.static_layer and self.guard_margin_m is None and not self.navigation.replan:
+            raise UserInputError(
+                "navigation.static_layer=true changes nothing with guard_margin_m=null and navigation.replan=false: "
+                "detours and the stop zone read it"
+            )
 
     @property
     def runs(self) -> tuple[str, ...]:

@@ -14,3 +14,14 @@ class NavigationSettings:
 
     replan: bool = False
     watchdog: bool = False
+
+
+@dataclass(frozen=True)
+class CourseNavigationSettings(NavigationSettings):
+    """The same in ``conf/course.yaml``, where a robot also knows a map.
+
+    Attributes:
+        static_layer: let detours and the stop zone keep clear of what the planner's map shows, seen or not.
+    """
+
+    static_layer: bool = False

@@ -1,8 +1,8 @@
 """Drive a robot over DDS, without ROS: ``python -m rcdsac_trl.deploy.dds_node <name or folder>``.
 
-For robots whose ROS 2 runs on CycloneDDS. It reads ``scan`` (or clouds), ``odom``, ``plan``, ``tf`` and ``tf_static``,
-and writes ``cmd_vel`` (as ``geometry_msgs/TwistStamped`` and as ``geometry_msgs/Twist``), the return's quantiles on
-``return_quantiles``, and on ``drive_status`` why the robot does not go as the agent would.
+For robots whose ROS 2 runs on CycloneDDS. It reads ``scan`` (or clouds), ``odom``, ``plan``, ``tf``, ``tf_static`` and,
+for detours, ``map``. It writes ``cmd_vel`` (as ``geometry_msgs/TwistStamped`` and as ``geometry_msgs/Twist``), the
+return's quantiles on ``return_quantiles``, and on ``drive_status`` why the robot does not go as the agent would.
 ``beta`` (``std_msgs/Float64``) and ``stop`` (``std_msgs/Bool``) are topics, and may be sent while it runs. It needs
 ``cyclonedds``, an extra: ``pip install 'rcdsac-trl[dds]'``.
 """
@@ -184,7 +184,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="SECONDS",
         help="stand when the localisation's newest word is older (default: %(default)s; inf: never for that)",
     )
-    parser.add_argument("--detours", action="store_true", help="lead around what blocks the way for some seconds")
+    parser.add_argument(
+        "--detours",
+        action="store_true",
+        help="lead around what blocks the way for some seconds, and keep clear of what map shows",
+    )
     parser.add_argument("--base-frame", help="the robot's frame; else the odometry's child_frame_id")
     parser.add_argument("--use-sim-time", action="store_true", help="the clock is that of the topic clock")
     parser.add_argument(

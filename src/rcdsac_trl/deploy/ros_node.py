@@ -1,10 +1,10 @@
 """A ROS 2 node around :class:`~rcdsac_trl.deploy.policy.driver.Driver`; the one file that needs ``rclpy``.
 
 Run it where ROS 2 is sourced: ``python -m rcdsac_trl.deploy.ros_node --ros-args -p agent:=<name or folder>``.
-It reads ``scan`` (or clouds), ``odom``, ``plan``, ``/tf`` and ``/tf_static``; it writes ``cmd_vel``
-(``geometry_msgs/TwistStamped``, or ``Twist`` with the parameter ``command_type``), the return's quantiles on
-``return_quantiles``, and on ``drive_status`` why the robot does not go as the agent would. ``beta`` and ``stop`` may be
-set while it runs; every parameter is explained in docs/nav2.md.
+It reads ``scan`` (or clouds), ``odom``, ``plan``, ``/tf``, ``/tf_static`` and, for detours, ``map``. It writes
+``cmd_vel`` (``geometry_msgs/TwistStamped``, or ``Twist`` with the parameter ``command_type``), the return's quantiles
+on ``return_quantiles``, and on ``drive_status`` why the robot does not go as the agent would. ``beta`` and ``stop`` may
+be set while it runs; every parameter is explained in docs/nav2.md.
 """
 
 import importlib
@@ -29,7 +29,7 @@ except ModuleNotFoundError as error:
     raise SystemExit(2) from None
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -50,6 +50,8 @@ from rcdsac_trl.robot.sectors import Mount
 _COMMAND_TYPES = {"TwistStamped": TwistStamped, "Twist": Twist}
 _SCAN, _CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 _NEEDED = {"odom": "nav_msgs/msg/Odometry", "plan": "nav_msgs/msg/Path"}
+# What holds for whoever comes later: as map servers publish.
+_KEPT_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # How tf2 publishes and reads.
 _TF_QOS = QoSProfile(depth=100)
 _STATIC_TF_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -135,6 +137,8 @@ class PolicyNode(Node):
         self.create_subscription(TFMessage, "/tf", driver.on_transforms, _TF_QOS)
         self.create_subscription(TFMessage, "/tf_static", partial(driver.on_transforms, static=True), _STATIC_TF_QOS)
         self.create_subscription(PoseWithCovarianceStamped, "pose", driver.on_pose, 1)
+        if driver.policy.navigator is not None:
+            self.create_subscription(OccupancyGrid, "map", driver.on_map, _KEPT_QOS)
 
     def _set(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:

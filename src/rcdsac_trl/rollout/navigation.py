@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
+from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
 from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import range_distances, waypoint_observation, waypoint_positions
@@ -19,12 +20,14 @@ from rcdsac_trl.rollout.policies import AgentNoise
 _AT_ORIGIN = (0.0, 0.0, 0.0)
 
 
-def navigator_of(settings: NavigationSettings, robot: RobotSettings) -> Navigator | None:
-    """Make what navigates around an agent; None where nothing is asked for."""
-    if not (settings.replan or settings.watchdog):
+def navigator_of(
+    settings: NavigationSettings, robot: RobotSettings, static_layer: StaticLayer | None = None
+) -> Navigator | None:
+    """Make what navigates around an agent, on a map if there is one; None where nothing is asked for."""
+    if not (settings.replan or settings.watchdog or static_layer is not None):
         return None
     watchdog = WatchdogSettings() if settings.watchdog else None
-    return Navigator(NavigatorSettings(replan=settings.replan, watchdog=watchdog), robot)
+    return Navigator(NavigatorSettings(replan=settings.replan, watchdog=watchdog), robot, static_layer)
 
 
 class NavigatedPolicy(TensorDictModuleBase):

@@ -6,6 +6,7 @@ It knows what an agent knows: ranges and measured velocities. Where the robot is
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from rcdsac_trl.system.jit import njit
 
 _NEVER = -math.inf
 _NOTHING = np.empty((0, 6))
+_NOWHERE = np.empty((0, 2))
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,46 @@ class LocalMapSettings:
     def num_cells(self) -> int:
         """Cells along a side."""
         return round(self.size_m / self.cell_m)
+
+
+class Clearances(NamedTuple):
+    """How far the places of a square are from whatever is nearest.
+
+    Attributes:
+        field_m: distance from the middle of each cell to the nearest point's cell, m, float32 [n, n], rows along y; at
+            most a reach.
+        corner: lower corner of the square, x and y in m.
+        cell_m: side of a cell, m.
+    """
+
+    field_m: NDArray[np.float32]
+    corner: tuple[float, float]
+    cell_m: float
+
+
+def clearances_around(
+    place: tuple[float, float], points: NDArray[np.float64], size_m: float, settings: LocalMapSettings
+) -> Clearances:
+    """Return how far the places of a square are from the nearest of some points.
+
+    Args:
+        place: middle of the square, x and y in m.
+        points: x and y in m, [k, 2].
+        size_m: side of the square, m.
+        settings: their cells and reach are taken.
+    """
+    n = round(size_m / settings.cell_m)
+    corner = _corner(place, n, settings.cell_m)
+    held, field_m = np.zeros((n, n), np.bool_), np.empty((n, n), np.float32)
+    _mark(held, points, *corner, settings.cell_m)
+    _measure(field_m, held, settings.cell_m, settings.reach_m)
+    return Clearances(field_m, corner, settings.cell_m)
+
+
+def _corner(place: tuple[float, float], n: int, cell_m: float) -> tuple[float, float]:
+    """Return the lower corner, on the grid of cells, of a square of n x n cells around a place."""
+    x, y = place
+    return (math.floor(x / cell_m) - n // 2) * cell_m, (math.floor(y / cell_m) - n // 2) * cell_m
 
 
 class LocalMap:
@@ -118,12 +160,19 @@ class LocalMap:
         place = x + ahead_m * math.cos(yaw), y + ahead_m * math.sin(yaw)
         _put(self.points, *place, self._reckoning.time_s, self.settings.cell_m)
 
-    def observe(self, ranges_m: NDArray[np.float64], moving: NDArray[np.float64] = _NOTHING) -> None:
+    def observe(
+        self,
+        ranges_m: NDArray[np.float64],
+        moving: NDArray[np.float64] = _NOTHING,
+        standing: NDArray[np.float64] = _NOWHERE,
+    ) -> None:
         """Forget what is old, clear what is seen through, and add what is seen but does not move.
 
         Args:
             ranges_m: smallest distance in each sector, float64 [180], m; ``inf`` where nothing is in reach.
             moving: what moves, float64 [k, 6]; see :attr:`rcdsac_trl.robot.mover_tracks.MoverTracks.moving`.
+            standing: what is known to stand, seen or not, x and y in m, odometry frame, float64 [k, 2]. It counts until
+                the next call, and is not remembered.
         """
         settings = self.settings
         _forget(self.points, self._reckoning.time_s - settings.memory_s, self.pose, 0.5 * settings.size_m)
@@ -131,15 +180,31 @@ class LocalMap:
         _clear(self.points, self.pose, ranges_m, self.sensed, settings.clearing_margin_m, far_m)
         _add(self.points, time_s, self.pose, ranges_m, self.sensed, settings.cell_m, far_m)
         _take_out(self.points, time_s, moving, settings.mover_margin_m)
-        _measure(self.field_m, self.points, self.pose, settings.cell_m, settings.reach_m)
+        held = np.zeros(self.field_m.shape, np.bool_)
+        _hold(held, self.points, self.pose, settings.cell_m)
+        _mark(held, standing, *self.corner, settings.cell_m)
+        _measure(self.field_m, held, settings.cell_m, settings.reach_m)
 
     @property
     def corner(self) -> tuple[float, float]:
         """Lower corner of the square around the robot, on the grid of cells: x and y in m, odometry frame."""
-        half = self.settings.num_cells // 2
-        cell_m = self.settings.cell_m
+        return _corner(self.place, self.settings.num_cells, self.settings.cell_m)
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """Where the robot is, x and y in m, odometry frame."""
         x, y, _ = self.pose.tolist()
-        return (math.floor(x / cell_m) - half) * cell_m, (math.floor(y / cell_m) - half) * cell_m
+        return x, y
+
+    @property
+    def clearances(self) -> Clearances:
+        """How far the places of the square are from whatever is nearest, odometry frame."""
+        return Clearances(self.field_m, self.corner, self.settings.cell_m)
+
+    @property
+    def remembered(self) -> NDArray[np.float64]:
+        """The points that are remembered, x and y in m, odometry frame, float64 [k, 2]."""
+        return self.points[np.isfinite(self.points[..., 2])][:, :2]
 
     def distance_m(self, x: float, y: float) -> float:
         """Return how far the cell of a place in the square, odometry frame, is from the nearest point's, m."""
@@ -224,22 +289,41 @@ def _take_out(points: np.ndarray, time_s: float, moving: np.ndarray, margin_m: f
 
 
 @njit
-def _measure(field_m: np.ndarray, points: np.ndarray, pose: np.ndarray, cell_m: float, reach_m: float) -> None:
+def _hold(held: np.ndarray, points: np.ndarray, pose: np.ndarray, cell_m: float) -> None:
+    """Say which cells of the square around a robot hold a remembered point."""
+    n = held.shape[0]
+    row0 = math.floor(pose[1] / cell_m) - n // 2
+    column0 = math.floor(pose[0] / cell_m) - n // 2
+    for i in range(n):
+        for j in range(n):
+            held[i, j] = points[(row0 + i) % n, (column0 + j) % n, 2] != _NEVER
+
+
+@njit
+def _mark(held: np.ndarray, standing: np.ndarray, x0: float, y0: float, cell_m: float) -> None:
+    """Add the cells that hold one of some points."""
+    n = held.shape[0]
+    row0, column0 = round(y0 / cell_m), round(x0 / cell_m)
+    for x, y in standing:
+        i, j = math.floor(y / cell_m) - row0, math.floor(x / cell_m) - column0
+        if 0 <= i < n and 0 <= j < n:
+            held[i, j] = True
+
+
+@njit
+def _measure(field_m: np.ndarray, held: np.ndarray, cell_m: float, reach_m: float) -> None:
     """Write the distance to the nearest cell that holds a point, exactly, up to a reach.
 
     First along each row, then over the rows around: what is squared may be minimised one axis after the other.
     """
     n = field_m.shape[0]
-    row0 = math.floor(pose[1] / cell_m) - n // 2
-    column0 = math.floor(pose[0] / cell_m) - n // 2
     reach = math.ceil(reach_m / cell_m)
     along = np.empty((n, n), np.float32)
     far = np.float32(reach + 1)
     for i in range(n):
-        ring = (row0 + i) % n
         gap = far
         for j in range(n):
-            gap = np.float32(0.0) if points[ring, (column0 + j) % n, 2] != _NEVER else min(gap + np.float32(1.0), far)
+            gap = np.float32(0.0) if held[i, j] else min(gap + np.float32(1.0), far)
             along[i, j] = gap
         for j in range(n - 2, -1, -1):
             along[i, j] = min(along[i, j], along[i, j + 1] + np.float32(1.0))

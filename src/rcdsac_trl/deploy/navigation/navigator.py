@@ -1,7 +1,8 @@
 """What stands between a path and an agent: other waypoints where the way is blocked, and ways out of a standstill.
 
 It knows what an agent knows: ranges, the next two waypoints, velocities. All that it remembers is in the frame of the
-odometry, so a localisation that corrects itself changes nothing.
+odometry, so a localisation that corrects itself changes nothing. It may be given a map besides, and where the robot is
+on it.
 """
 
 import math
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.navigation.detour import Place, is_clear, plan_detour
-from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
+from rcdsac_trl.deploy.navigation.local_map import Clearances, LocalMap, LocalMapSettings, clearances_around
+from rcdsac_trl.deploy.navigation.static_layer import Pose, StaticLayer
 from rcdsac_trl.deploy.navigation.watchdog import Watchdog, WatchdogSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
@@ -29,6 +31,8 @@ _NEARBY_M = 1.5
 _REPLAN_S, _CORNER_M = 0.4, 0.3
 # Two waypoints nearer to each other are one, the goal.
 _SAME_M = 1e-3
+# Where a map is known, detours are planned on so large a square of it, m: the way around a wall may be long.
+_WIDE_M = 20.0
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,7 @@ class Navigator:
     Args:
         settings: what it does.
         robot: that the agent drives.
+        static_layer: what a map shows; None: it knows what was seen alone.
 
     Example:
         >>> navigator = Navigator(NavigatorSettings(blocked_s=0.0))
@@ -96,8 +101,14 @@ class Navigator:
         True
     """
 
-    def __init__(self, settings: NavigatorSettings = NavigatorSettings(), robot: RobotSettings = PAPER) -> None:
+    def __init__(
+        self,
+        settings: NavigatorSettings = NavigatorSettings(),
+        robot: RobotSettings = PAPER,
+        static_layer: StaticLayer | None = None,
+    ) -> None:
         self.settings = settings
+        self.static_layer = static_layer
         self._robot = robot
         self.reset()
 
@@ -108,6 +119,7 @@ class Navigator:
         self._map = LocalMap(LocalMapSettings(memory_s=self.settings.memory_s), nothing, max_range_m)
         self._tracks = MoverTracks(TrackSettings(), nothing, max_range_m)
         self._trail: deque[Place] = deque(maxlen=_TRAIL_PLACES)
+        self._on_map: Pose | None = None
         self._blocked_s = self._planned_s = 0.0
         self._detour: list[Place] = []
         self._watchdog = None if self.settings.watchdog is None else Watchdog(self.settings.watchdog)
@@ -119,6 +131,7 @@ class Navigator:
         waypoints: tuple[Place, Place],
         velocity: tuple[float, float],
         elapsed_s: float,
+        pose: Pose | None = None,
     ) -> Advice:
         """Take in what is known now, and say how to go on.
 
@@ -128,22 +141,20 @@ class Navigator:
             waypoints: the next two, x and y in m, robot's frame.
             velocity: measured, m/s and rad/s.
             elapsed_s: since the last call, 0 at the first, s.
+            pose: of the robot in the frame of the static layer, x and y in m and yaw in rad; None: nothing is known of
+                the map around it.
         """
+        self._on_map = pose
         self._observe(distances_m, covered, velocity, elapsed_s)
         next_two = self._waypoints(waypoints, elapsed_s) if self.settings.replan else waypoints
         boldness, draws, instead = 0.0, False, None
         been = self._in_robot(np.array(self._trail))
         if self._watchdog is not None:
             target = self._placed(waypoints[0])
-            self._watchdog.observe(self._here, target, elapsed_s)
+            self._watchdog.observe(self._map.place, target, elapsed_s)
             boldness, draws = self._watchdog.boldness, self._watchdog.draws
-            instead = self._watchdog.way_out(self._here, been, next_two[0], elapsed_s)
+            instead = self._watchdog.way_out(self._map.place, been, next_two[0], elapsed_s)
         return Advice(next_two, boldness, draws, instead, self._known(distances_m, covered), been)
-
-    @property
-    def _here(self) -> Place:
-        x, y, _ = self._map.pose.tolist()
-        return x, y
 
     def _observe(
         self,
@@ -156,17 +167,20 @@ class Navigator:
         self._map.sensed = covered
         self._map.move(*velocity, elapsed_s)
         self._tracks.observe(seen_m, self._map.pose, elapsed_s, covered)
-        self._map.observe(seen_m, self._tracks.moving)
+        standing = self._on_map_within(0.5 * self._map.settings.size_m)
+        self._map.observe(seen_m, self._tracks.moving, self._in_odometry(standing))
         # Only ahead: who backs a little beyond what it knows must not take that as known.
-        ahead = velocity[0] > 0.0 and math.dist(self._trail[-1], self._here) > _TRAIL_STEP_M if self._trail else True
+        ahead = (
+            velocity[0] > 0.0 and math.dist(self._trail[-1], self._map.place) > _TRAIL_STEP_M if self._trail else True
+        )
         if ahead:
-            self._trail.append(self._here)
+            self._trail.append(self._map.place)
 
     def _waypoints(self, waypoints: tuple[Place, Place], elapsed_s: float) -> tuple[Place, Place]:
         """Return the next two waypoints, of a detour where the way to the first is blocked."""
         radius_m = self._robot.circumradius_m
         target, after = self._placed(waypoints[0]), self._placed(waypoints[1])
-        if is_clear(self._map, self._here, target, radius_m):
+        if is_clear(self._map.clearances, self._map.place, target, radius_m):
             self._blocked_s = 0.0
             self._detour = []
             return waypoints
@@ -176,7 +190,7 @@ class Navigator:
         self._planned_s += elapsed_s
         if not self._detour or self._planned_s >= _REPLAN_S:
             self._detour, self._planned_s = self._planned(target, after), 0.0
-        while len(self._detour) > 1 and math.dist(self._detour[0], self._here) < _CORNER_M:
+        while len(self._detour) > 1 and math.dist(self._detour[0], self._map.place) < _CORNER_M:
             self._detour = self._detour[1:]
         if not self._detour:
             return waypoints
@@ -185,28 +199,53 @@ class Navigator:
 
     def _planned(self, target: Place, after: Place) -> list[Place]:
         """Return the corners of a way to the next waypoint, or past it where something stands on it; [] without one."""
-        radius_m = self._robot.circumradius_m
-        corners = plan_detour(self._map, target, radius_m)
+        clearances, here, radius_m = self._surroundings(), self._map.place, self._robot.circumradius_m
+        corners = plan_detour(clearances, here, target, radius_m)
         if not corners and math.dist(target, after) > _SAME_M:
-            corners = plan_detour(self._map, after, radius_m)
+            corners = plan_detour(clearances, here, after, radius_m)
         return corners
+
+    def _surroundings(self) -> Clearances:
+        """Return what detours are planned on: what is remembered, and far around it what the map shows."""
+        standing = self._on_map_within(0.5 * _WIDE_M)
+        if not len(standing):
+            return self._map.clearances
+        points = np.concatenate([self._map.remembered, self._in_odometry(standing)])
+        return clearances_around(self._map.place, points, _WIDE_M, self._map.settings)
+
+    def _on_map_within(self, reach_m: float) -> NDArray[np.float64]:
+        """Return the edges that the map shows in a square around the robot, in its frame, m, [k, 2]."""
+        if self.static_layer is None or self._on_map is None:
+            return np.empty((0, 2))
+        return self.static_layer.around(self._on_map, reach_m)
 
     def _known(self, distances_m: NDArray[np.float64], covered: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the distances of all sectors, from memory where they are not sensed."""
-        points = self._map.points[np.isfinite(self._map.points[..., 2])][:, :2]
-        near = self._in_robot(points)
-        apart = np.hypot(near[:, 0], near[:, 1])
+        remembered_m = self._nearest_m(self._in_robot(self._map.remembered))
+        known_m = np.where(covered, distances_m, remembered_m)
+        # On the map is what no sensor sees, too.
+        return np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M)))
+
+    def _nearest_m(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the nearest of points in the robot's frame is, by sector, float64 [180]; ``inf``: none."""
+        apart = np.hypot(points[:, 0], points[:, 1])
         counts = (apart < _NEARBY_M) & (apart > self._robot.body_radius_m)
-        bins = np.floor(np.arctan2(near[counts, 1], near[counts, 0]) / BIN_RAD).astype(np.intp) % NUM_BINS
-        remembered = np.full(NUM_BINS, np.inf)
-        np.minimum.at(remembered, bins, apart[counts])
-        return np.where(covered, distances_m, remembered)
+        bins = np.floor(np.arctan2(points[counts, 1], points[counts, 0]) / BIN_RAD).astype(np.intp) % NUM_BINS
+        nearest_m = np.full(NUM_BINS, np.inf)
+        np.minimum.at(nearest_m, bins, apart[counts])
+        return nearest_m
 
     def _placed(self, point: Place) -> Place:
         """Return a point of the robot's frame in that of the odometry."""
+        ((x, y),) = self._in_odometry(np.array([point])).tolist()
+        return x, y
+
+    def _in_odometry(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points [k, 2] of the robot's frame in that of the odometry."""
         x, y, yaw = self._map.pose.tolist()
         cos, sin = math.cos(yaw), math.sin(yaw)
-        return x + cos * point[0] - sin * point[1], y + sin * point[0] + cos * point[1]
+        placed: NDArray[np.float64] = points @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+        return placed
 
     def _in_robot(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return points [k, 2] of the odometry's frame in the robot's."""

@@ -61,7 +61,8 @@ class Driver:
         zero_means: what the scanner's driver means by a reading of 0; see :class:`Scan`.
         nan_means: what it means by NaN.
         frames: how the robot's place in the path's frame is known; None for the defaults.
-        detours: give the policy a navigator that leads around what blocks the way; it needs numba.
+        detours: give the policy a navigator that leads around what blocks the way; it needs numba. If a map comes, it
+            keeps clear of that, too, and so does the stop zone: of glass, which no sensor sees.
 
     Attributes:
         beta: how much risk to take; None: the policy's default. May be set at any time.
@@ -105,7 +106,7 @@ class Driver:
         self._odometry: Any = None
         self._poses = PoseWatch()
         self._follower: PathFollower | None = None
-        self._path_frame = ""
+        self._path_frame = self._map_frame = ""
         self._no_path = "there is no path yet"
 
     @property
@@ -161,6 +162,19 @@ class Driver:
         except Exception as error:  # as in on_cloud()
             self._faults["pose"] = f"the robot's pose cannot be read ({described(error)})"
 
+    def on_map(self, message: Any) -> None:
+        """Take a ``nav_msgs/OccupancyGrid``, in the frame of the path; it means nothing without a navigator."""
+        if self.policy.navigator is None:
+            return
+        self._faults.pop("map", None)
+        try:
+            self.policy.navigator.static_layer = messages.static_layer_of(message)
+            self._map_frame = str(message.header.frame_id)
+        except UserInputError as error:
+            self._faults["map"] = f"the map cannot be read ({error})"
+        except Exception as error:  # as in on_cloud()
+            self._faults["map"] = f"the map cannot be read ({described(error)})"
+
     def on_path(self, message: Any) -> None:
         """Take a ``nav_msgs/Path``; the goal is its last pose. One without poses means: stand."""
         self._faults.pop("path", None)
@@ -215,11 +229,16 @@ class Driver:
             return self.policy.refuse("the goal is reached")
         if (missing := self._missing()) is not None:
             return self.policy.refuse(missing)
+        if self._map_frame not in ("", self._path_frame):
+            return self.policy.refuse(
+                f"the map is in frame {self._map_frame!r}, the path in {self._path_frame!r}: plan on that map, or give "
+                "the node none"
+            )
         ranges, scanned_s = self._ranges(pose_s)
         stamps = Stamps(now_s, scanned_s, pose_s, moved_s)
         velocity = messages.velocity_of_odometry(self._odometry)
         self.situation = Situation(here, waypoints, ranges, velocity)
-        return self.policy.act(ranges, waypoints, velocity, self.beta, stamps=stamps)
+        return self.policy.act(ranges, waypoints, velocity, self.beta, stamps=stamps, pose=here)
 
     def _located(self, now_s: float) -> tuple[tuple[float, float, float], float, float]:
         """Return the robot's pose in the path's frame, the stamp of that pose, and the stamp of the odometry."""

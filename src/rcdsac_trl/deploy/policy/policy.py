@@ -19,6 +19,7 @@ from rcdsac_trl.deploy.policy.input_checks import (
     Stamps,
     as_given_now,
     check_stamps,
+    pose_of,
     sectors_of,
     velocity_of,
     waypoints_of,
@@ -37,6 +38,7 @@ from rcdsac_trl.seeding import stream
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator
+    from rcdsac_trl.deploy.navigation.static_layer import Pose
 
 
 def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> Guard | None:
@@ -299,6 +301,7 @@ class Policy:
         *,
         collision_weight: float | None = None,
         stamps: Stamps | None = None,
+        pose: Any = None,
     ) -> Command:
         """Return the command for this control period.
 
@@ -310,6 +313,7 @@ class Policy:
             beta: how much risk to take; may change at every call. None: :attr:`default_beta`.
             collision_weight: what agents of the row RCWR are told instead; None: the middle of the trained range.
             stamps: when the input was measured; without them nobody notices what is late, repeated or out of order.
+            pose: where the robot is on its navigator's map, x and y in m and yaw in rad; needed where that has one.
         """
         try:
             if self._halted:
@@ -321,11 +325,20 @@ class Policy:
             next_two = waypoints_of(waypoints)
             measured = velocity_of(velocity, self.robot)
             context = self._context(beta, collision_weight)
+            on_map = self._on_map(pose)
         except UserInputError as error:
             return self.refuse(str(error))
         except Exception as error:  # whatever was given: what it does when it is read is not ours to know
             return self.refuse(f"the input cannot be read ({described(error)})")
-        return self._drive(sectors, next_two, measured, context, stamps)
+        return self._drive(sectors, next_two, measured, context, stamps, on_map)
+
+    def _on_map(self, pose: Any) -> "Pose | None":
+        """Return where the robot is on its navigator's map; None where that has none."""
+        if self.navigator is None or self.navigator.static_layer is None:
+            return None
+        if pose is None:
+            raise BadInputError("the navigator has a map, and act() was not told where on it the robot is: give pose=")
+        return pose_of(pose)
 
     def _drive(
         self,
@@ -334,6 +347,7 @@ class Policy:
         measured: tuple[float, float],
         context: float | None,
         stamps: Stamps | None,
+        on_map: "Pose | None",
     ) -> Command:
         if self._periods.memory_is_old(stamps):
             self._forget()
@@ -344,7 +358,7 @@ class Policy:
         if fresh:
             if self.navigator is not None:
                 self._advice = self.navigator.advise(
-                    sectors.distances_m, sectors.covered, next_two, measured, elapsed_s
+                    sectors.distances_m, sectors.covered, next_two, measured, elapsed_s, on_map
                 )
                 next_two, context = self._advice.waypoints, bolder(self.config, context, self._advice.boldness)
             self._see(*self._observer.observe(sectors, next_two, measured, elapsed_s), context)

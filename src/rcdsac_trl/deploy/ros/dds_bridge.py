@@ -34,11 +34,12 @@ READS: dict[str, Any] = {
     "tf": dds_types.TFMessage,
     "tf_static": dds_types.TFMessage,
     "pose": dds_types.PoseWithCovarianceStamped,
+    "map": dds_types.OccupancyGrid,
     "clock": dds_types.Clock,
     "beta": dds_types.Float64,
     "stop": dds_types.Bool,
 }
-"""Topics that are read, and their types."""
+"""Topics that are read, and their types; ``map`` only by a driver with a navigator."""
 CLOUD: Any = dds_types.PointCloud2
 """Type of the clouds, which are read from topics of any name."""
 WRITES: dict[str, Any] = {
@@ -51,8 +52,8 @@ UNSTAMPED: Any = dds_types.Twist
 
 # ROS's sensor data: readers that ask for less than writers offer meet all of them.
 _SENSORS = {"scan", "odom", "tf", "clock"}
-# Each of their writers says something else, which holds for whoever comes later.
-_KEPT = {"tf_static"}
+# What their writers say holds for whoever comes later.
+_KEPT = {"tf_static", "map"}
 # All that came since the last step counts, of however many writers, and not the newest alone.
 _MANY = {"tf", "tf_static"}
 _TOPIC = re.compile(r"/?([A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*)")
@@ -107,6 +108,7 @@ class DdsBridge:
         self._readers = {
             name: DataReader(participant, self._topic(participant, name, kind), _reader_qos(name))
             for name, kind in READS.items()
+            if name != "map" or driver.policy.navigator is not None
         }
         self._clouds = {
             name: DataReader(participant, Topic(participant, f"rt/{name}", CLOUD), _qos(reliable=False))
@@ -181,10 +183,13 @@ class DdsBridge:
             "tf": driver.on_transforms,
             "tf_static": partial(driver.on_transforms, static=True),
             "pose": driver.on_pose,
+            "map": driver.on_map,
             "beta": self._on_beta,
             "stop": self._on_stop,
         }
         for name, take in takers.items():
+            if name not in self._readers:
+                continue
             for message in _all(self._readers[name]) if name in _MANY else _newest(self._readers[name]):
                 take(message)
         for reader in self._clouds.values():

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
+from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.deploy.sensors.scan import Meaning, Scan
@@ -22,6 +23,8 @@ from rcdsac_trl.robot.sectors import Mount, is_finite_number
 _ANGLE_SLACK_RAYS, _ANGLE_SLACK_SHARE = 2.0, 0.05
 # builtin_interfaces/Time holds whole seconds in 32 bits.
 _LAST_STAMP_S = 2.0**31
+# From so many percent on, a cell of a nav_msgs/OccupancyGrid is occupied; -1 is unknown.
+_OCCUPIED_PERCENT = 65
 # sensor_msgs/PointField: number of a type to NumPy's.
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -162,6 +165,22 @@ def path_of(message: Any) -> NDArray[np.float64]:
     """Return the points of a ``nav_msgs/Path``, m, [n, 2], in its header's frame."""
     points = [(float(stamped.pose.position.x), float(stamped.pose.position.y)) for stamped in message.poses]
     return np.array(points, dtype=np.float64).reshape(-1, 2)
+
+
+def static_layer_of(message: Any) -> StaticLayer:
+    """Return what a ``nav_msgs/OccupancyGrid`` shows, in its header's frame; unknown cells count as free.
+
+    Raises:
+        UserInputError: if it has not as many cells as it says, they are no numbers, or its origin is no pose.
+    """
+    info = message.info
+    width, height = int(info.width), int(info.height)
+    cells = numbers_of(message.data, "the map's cells")
+    if cells.shape != (width * height,):
+        raise UserInputError(f"the map says {height} x {width} cells and has {cells.size}: its sender is broken")
+    origin = float(info.origin.position.x), float(info.origin.position.y), _yaw(info.origin.orientation)
+    occupied = cells.reshape(height, width) >= _OCCUPIED_PERCENT
+    return StaticLayer.of_cells(occupied, float(info.resolution), origin)
 
 
 def twist_stamped(command: Command, now_s: float, make: Callable[[str], Any], *, frame_id: str = "base_link") -> Any:

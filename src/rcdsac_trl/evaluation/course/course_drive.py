@@ -48,7 +48,9 @@ class Pilot(Protocol):
         """Forget everything before."""
         ...
 
-    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None) -> Command:
+    def act(
+        self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None, pose: Pose
+    ) -> Command:
         """Return the command for this control period."""
         ...
 
@@ -242,7 +244,7 @@ def drive_course(
             before_step()
             seen, velocity = world.seen(), world.velocity
             stamps = Stamps(now_s, now_s, now_s, now_s)
-            command = pilot.act(seen, waypoints, velocity, beta, stamps=stamps)
+            command = pilot.act(seen, waypoints, velocity, beta, stamps=stamps, pose=world.odometry.pose)
             commanded = (command.v_m_per_s, command.omega_rad_per_s)
             moved = world.step(*commanded)
             step = {"distances_m": seen.distances_m, "velocities": velocity, "commands": commanded}

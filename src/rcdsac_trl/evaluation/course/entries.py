@@ -8,6 +8,7 @@ import numpy as np
 import rcdsac_trl
 from rcdsac_trl.config.course_settings import CourseSettings
 from rcdsac_trl.deploy import Guard, InputLimits, Policy, shipped_names
+from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
 from rcdsac_trl.deploy.policy.registry import HANDFUL
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.camera_rig import camera_poses, covered
@@ -15,6 +16,7 @@ from rcdsac_trl.evaluation.course.course_drive import Pilot
 from rcdsac_trl.evaluation.course.pursuit_pilot import PursuitPilot
 from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.rollout.navigation import navigator_of
+from rcdsac_trl.world.office.building import make_office
 
 # What the paper's second table sets each measure to.
 _PAPER_BETAS = {"cvar": (0.25, 0.75), "pow": (-2.0, -1.0)}
@@ -58,6 +60,7 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
                 "no agent is shipped with this version: name who drives with run=<folder> or baseline=pursuit"
             )
     policies = {run: rcdsac_trl.load(run, guard=None) for run in runs}
+    static_layer = _static_layer(settings) if settings.navigation.static_layer else None
     for run, policy in policies.items():
         if policy.robot != PAPER:
             raise UserInputError(
@@ -66,7 +69,7 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
             )
         policy.guard = None if settings.guard_margin_m is None else Guard(margin_m=settings.guard_margin_m)
         policy.acting = settings.acting.of(policy.acting)
-        policy.navigator = navigator_of(settings.navigation, policy.robot)
+        policy.navigator = navigator_of(settings.navigation, policy.robot, static_layer)
         check_sensor(run, policy, settings.camera.view_deg)
     conditioned = [run for run, policy in policies.items() if policy.config.context == "beta"]
     if settings.beta is not None and not conditioned:
@@ -75,6 +78,12 @@ def entries_of(settings: CourseSettings) -> list[Entry]:
     if settings.baseline is not None:
         entries.append(Entry("pursuit", "pursuit", None, None, PursuitPilot()))
     return entries
+
+
+def _static_layer(settings: CourseSettings) -> StaticLayer:
+    """Return what the planner's map shows of the office."""
+    map_ = make_office(settings.people, settings.hollow).map
+    return StaticLayer.of_shapes(map_.segments(mapped_only=True), map_.circles(mapped_only=True))
 
 
 def _of_policy(run: str, policy: Policy, betas: Sequence[float] | None) -> list[Entry]:

@@ -6,6 +6,7 @@ import torch
 
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.input_checks import Stamps
+from rcdsac_trl.evaluation.course.odometry import Pose
 from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import waypoint_observation
 from rcdsac_trl.rollout.planners.pursuit import pursuit_action
@@ -21,7 +22,9 @@ class PursuitPilot:
     def reset(self) -> None:
         """There is nothing to forget."""
 
-    def act(self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None) -> Command:
+    def act(
+        self, ranges: Any, waypoints: Any, velocity: Any, beta: float | None, *, stamps: Stamps | None, pose: Pose
+    ) -> Command:
         """Return the command towards the first of the waypoints."""
         observed = waypoint_observation((0.0, 0.0, 0.0), *waypoints.tolist())
         v, omega = desired_velocities(

@@ -1,0 +1,121 @@
+"""What a map shows around a robot, as the static layer of a navigation stack's costmap does.
+
+Sensors miss what a map knows: glass, table tops, and what lies beyond their reach.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rcdsac_trl.errors import UserInputError
+
+Pose = tuple[float, float, float]
+
+# Points along an edge are at most so far apart, m: half a cell of the local map.
+_SPACING_M = 0.025
+_NO_CIRCLES = np.empty((0, 3))
+# Of a larger map it is not known where its numbers come from, nor would it be fast.
+_MOST_POINTS = 5_000_000
+
+
+class StaticLayer:
+    """Edges of what stands on a map.
+
+    Args:
+        points: along the edges, at most 2.5 cm apart, x and y in m, map frame, [k, 2].
+
+    Raises:
+        UserInputError: if they are not finite numbers of that shape, or more than five million.
+
+    Example:
+        >>> layer = StaticLayer.of_shapes(np.array([[1.0, -1.0, 1.0, 1.0]]))
+        >>> x, _ = layer.around((0.0, 0.0, math.pi), 3.6).T
+        >>> bool(np.allclose(x, -1.0))
+        True
+    """
+
+    def __init__(self, points: NDArray[np.float64]) -> None:
+        points = np.asarray(points, np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+            raise UserInputError(f"points of a map, {points.shape}, are not finite numbers [k, 2]: give x and y in m")
+        if len(points) > _MOST_POINTS:
+            raise UserInputError(
+                f"a map has {len(points)} points on its edges, above {_MOST_POINTS}: give a part of it"
+            )
+        # In the order of x: what is near is then found without looking at all of a large building.
+        self._points = points[np.argsort(points[:, 0], kind="stable")]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "StaticLayer":
+        """Share it: it never changes, and may be large."""
+        return self
+
+    @classmethod
+    def of_shapes(cls, segments: NDArray[np.float64], circles: NDArray[np.float64] = _NO_CIRCLES) -> "StaticLayer":
+        """Return the layer of straight edges and circles.
+
+        Args:
+            segments: x0, y0, x1, y1 in m, map frame, [n, 4].
+            circles: x, y and radius in m, [m, 3].
+        """
+        parts = [np.empty((0, 2))]
+        for x0, y0, x1, y1 in segments.tolist():
+            parts.append(np.linspace((x0, y0), (x1, y1), _number_of_points(math.hypot(x1 - x0, y1 - y0))))
+        for x, y, radius in circles.tolist():
+            angles = np.linspace(0.0, 2.0 * math.pi, _number_of_points(2.0 * math.pi * radius))
+            parts.append(np.stack([x + radius * np.cos(angles), y + radius * np.sin(angles)], axis=1))
+        return cls(np.concatenate(parts))
+
+    @classmethod
+    def of_cells(cls, occupied: NDArray[np.bool_], cell_m: float, origin: Pose) -> "StaticLayer":
+        """Return the layer of a grid: the sides of occupied cells beside others that are not.
+
+        Args:
+            occupied: rows along y, [h, w].
+            cell_m: side of a cell, m.
+            origin: pose of the grid's lower left corner, x and y in m and yaw in rad, map frame.
+
+        Raises:
+            UserInputError: if the cells have no size, or the layer would have more than five million points.
+        """
+        if not 0.0 < cell_m < math.inf:
+            raise UserInputError(f"cells of a map have a side of {cell_m:g} m: give one above 0")
+        padded = np.pad(np.asarray(occupied, np.bool_), 1)
+        # A side between two cells is an edge where one alone is occupied; corners are counted in cells.
+        below = np.argwhere(padded[1:] != padded[:-1]) - (0, 1)
+        beside = np.argwhere(padded[:, 1:] != padded[:, :-1]) - (1, 0)
+        along = np.linspace(0.0, 1.0, _number_of_points(cell_m))
+        if (len(below) + len(beside)) * len(along) > _MOST_POINTS:
+            raise UserInputError(
+                f"a map has {len(below) + len(beside)} sides of cells on its edges, more than a layer holds: give a "
+                "part of it, or a coarser one"
+            )
+        x = np.concatenate([(below[:, 1:] + along).ravel(), np.repeat(beside[:, 1], len(along))]) * cell_m
+        y = np.concatenate([np.repeat(below[:, 0], len(along)), (beside[:, :1] + along).ravel()]) * cell_m
+        x0, y0, yaw = origin
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return cls(np.stack([x0 + cos * x - sin * y, y0 + sin * x + cos * y], axis=1))
+
+    def around(self, pose: Pose, reach_m: float) -> NDArray[np.float64]:
+        """Return what is within a square around a robot, in its frame.
+
+        Args:
+            pose: of the robot, x and y in m and yaw in rad, map frame.
+            reach_m: half the side of the square, which lies along the map's axes, m.
+
+        Returns:
+            x and y in m, float64 [m, 2].
+        """
+        x, y, yaw = pose
+        first, last = np.searchsorted(self._points[:, 0], (x - reach_m, x + reach_m))
+        apart = self._points[first:last] - (x, y)
+        near = apart[np.abs(apart[:, 1]) < reach_m]
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        turned: NDArray[np.float64] = near @ np.array([[cos, -sin], [sin, cos]])
+        return turned
+
+
+def _number_of_points(length_m: float) -> int:
+    """Return how many points along an edge are near enough to each other, both ends among them."""
+    return max(2, math.ceil(length_m / _SPACING_M) + 1)
