@@ -105,10 +105,11 @@ def test_what_is_out_of_view_is_told_to_the_stop_zone() -> None:
         ranges = np.where(NARROW, seen((x, 0.0, 0.0), beside), np.inf)
         # From rest, reckoned along the mean of two velocities: it is given the same one from the first call on.
         advice = navigator.advise(ranges, NARROW, GOAL, (0.5, 0.0), 0.14 if step else 0.0)
-    there = advice.distances_m[44:46]  # 88 to 92 degrees, where no sector sees
+    known_m = navigator.known(ranges, NARROW, None)
+    there = known_m[44:46]  # 88 to 92 degrees, where no sector sees
     assert np.isfinite(there).any()
     assert there.min() == pytest.approx(0.5, abs=0.06)
-    assert np.isinf(advice.distances_m[120])
+    assert np.isinf(known_m[120])
     assert advice.been[0] == pytest.approx((-x, 0.0), abs=0.1)
 
 

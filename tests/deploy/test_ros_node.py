@@ -187,6 +187,11 @@ def test_it_leads_around_what_blocks_the_way_where_that_is_asked_for(ros_node: A
     assert driven(node).twist.linear.x != 0.0
     assert node.driver.policy._advice is not None
     assert node.qos["map"].durability == "kept"
+    node.timers[1]()
+    assert "nobody writes map: detours know what was seen alone" in node.told[-1]
+    Node.endpoints = {"map": ["nav_msgs/msg/OccupancyGrid"]}
+    node.timers[1]()
+    assert "map is written, and none has come" in node.told[-1]
     node.subscriptions["map"](None)
     node.timers[0]()
     assert "the map cannot be read" in node.published[-1].data

@@ -2,21 +2,27 @@
 
 import copy
 import math
+from array import array
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from test_frames import tf
 from test_navigator import ALL, AT_ONCE, in_robot, seen
 from test_robot_driver import header, laser, odometry, path
 
 from rcdsac_trl.deploy import Policy
-from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
+from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
+from rcdsac_trl.deploy.navigation.detour import plan_detour
+from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings, clearances_around
 from rcdsac_trl.deploy.navigation.navigator import Navigator
 from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
 from rcdsac_trl.deploy.policy.driver import Driver
+from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.ros.messages import static_layer_of
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.sectors import Mount
 from robots import AHEAD, OPEN, STANDING, agent
 
 AT_ORIGIN = (0.0, 0.0, 0.0)
@@ -65,8 +71,15 @@ def test_only_what_is_near_is_told() -> None:
     [
         (lambda: StaticLayer(np.zeros((3, 3))), "not finite numbers"),
         (lambda: StaticLayer(np.array([[math.nan, 0.0]])), "not finite numbers"),
-        (lambda: StaticLayer.of_cells(np.ones((2, 2)), 0.0, AT_ORIGIN), "side of 0 m"),
-        (lambda: StaticLayer.of_cells(np.indices((1500, 1500)).sum(axis=0) % 2, 0.05, AT_ORIGIN), "a coarser one"),
+        (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 0.0, AT_ORIGIN), "side of 0: give metres"),
+        (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 50.0, AT_ORIGIN), "side of 50: give metres"),
+        (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 0.1, (0.0, math.nan, 0.0)), "the origin of a map"),
+        (lambda: StaticLayer.of_cells(np.ones((2, 2), np.int8), 0.1, AT_ORIGIN), "whether it is occupied"),
+        (lambda: StaticLayer.of_cells(np.ones(2, bool), 0.1, AT_ORIGIN), "whether it is occupied"),
+        (lambda: StaticLayer.of_cells(np.indices((1500, 1500)).sum(axis=0) % 2 == 0, 0.05, AT_ORIGIN), "above 5000000"),
+        (lambda: StaticLayer.of_shapes(np.array([[0.0, 0.0, 1e9, 0.0]])), "and metres"),
+        (lambda: StaticLayer.of_shapes(np.zeros(4)), "segments of a map"),
+        (lambda: StaticLayer.of_shapes(np.empty((0, 4)), np.array([[0.0, 0.0, -1.0]])), "radius of -1 m"),
     ],
 )
 def test_what_is_no_map_is_refused(make: Any, told: str) -> None:
@@ -94,42 +107,69 @@ def test_a_detour_keeps_clear_of_a_pane_that_only_the_map_shows() -> None:
     advice = navigator.advise(OPEN, ALL, goal, (0.0, 0.0), 0.0, pose)
     corner = advice.waypoints[0]
     assert corner[1] < -0.8 - 0.2
-    assert advice.distances_m[0] == pytest.approx(math.inf)  # 1.5 m and farther: no stop zone reaches there
+    assert navigator.known(OPEN, ALL, pose)[0] == math.inf  # 1.5 m and farther: no stop zone reaches there
     assert navigator.advise(OPEN, ALL, goal, (0.0, 0.0), 0.14).waypoints == goal  # nobody says where it is
 
 
 def test_the_stop_zone_minds_a_pane_in_a_sector_that_sees_through_it() -> None:
     navigator = Navigator(AT_ONCE, static_layer=StaticLayer.of_shapes(PANE))
-    advice = navigator.advise(OPEN, ALL, ((3.5, 0.0),) * 2, (0.0, 0.0), 0.0, (0.7, 0.0, 0.0))
+    known_m = navigator.known(OPEN, ALL, (0.7, 0.0, 0.0))
     exact = seen((0.7, 0.0, 0.0), PANE)
     near = exact < 1.4
     assert near.sum() > 40
-    assert advice.distances_m[near] == pytest.approx(exact[near], abs=0.02)
+    assert known_m[near] == pytest.approx(exact[near], abs=0.02)
+
+
+def follow(walls: np.ndarray, start: tuple[float, float], goal: tuple[float, float]) -> list[tuple[float, float]]:
+    """Go to each waypoint that one navigator hands out on the way to a goal, with an exact pose."""
+    navigator = Navigator(AT_ONCE, static_layer=StaticLayer.of_shapes(walls))
+    places, v, omega = [start], 0.0, 0.0
+    for step in range(400):
+        pose = (*places[-1], 0.0)
+        two = (in_robot(goal, pose),) * 2
+        # Its odometry is told how the robot goes, as if that could go sideways.
+        navigator._map.pose[:2] = np.array(places[-1]) - start
+        dx, dy = navigator.advise(seen(pose, walls), ALL, two, (v, omega), 0.14 if step else 0.0, pose).waypoints[0]
+        apart = math.hypot(dx, dy)
+        if math.dist(places[-1], goal) < 0.1:
+            break
+        share = min(1.0, 0.08 / apart)
+        places.append((places[-1][0] + share * dx, places[-1][1] + share * dy))
+    return places
+
+
+def length_m(places: list[tuple[float, float]]) -> float:
+    return float(np.hypot(*np.diff(np.array(places), axis=0).T).sum())
 
 
 def test_on_a_map_a_way_is_found_that_is_longer_than_what_a_robot_remembers() -> None:
     """A wall from 6 m left of the way to 7 m right: its ends lie outside of the remembered square."""
     wall = np.array([[1.5, -7.0, 1.5, 6.0]])
-    given = ((2.5, 0.0), (2.5, 0.0))
-    known = Navigator(AT_ONCE, static_layer=StaticLayer.of_shapes(wall))
-    x, y, first = 0.0, 0.0, known.advise(seen(AT_ORIGIN, wall), ALL, given, (0.0, 0.0), 0.0, AT_ORIGIN)
-    assert first.waypoints[0][1] > 6.0
-    way_m = 0.0
-    for _ in range(200):
-        pose = (x, y, 0.0)
-        goal = in_robot((2.5, 0.0), pose)
-        told = Navigator(AT_ONCE, static_layer=StaticLayer.of_shapes(wall))
-        advice = told.advise(seen(pose, wall), ALL, (goal, goal), (0.0, 0.0), 0.0, pose)
-        dx, dy = advice.waypoints[0]
-        apart = math.hypot(dx, dy)
-        if apart < 0.15:
-            break
-        x, y, way_m = x + 0.15 * dx / apart, y + 0.15 * dy / apart, way_m + 0.15
-    assert math.dist((x, y), (2.5, 0.0)) < 0.2
-    assert 2.0 * 6.0 < way_m < 16.0  # around the nearer end
+    places = follow(wall, (0.0, 0.0), (2.5, 0.0))
+    assert math.dist(places[-1], (2.5, 0.0)) < 0.1
+    assert 12.0 < length_m(places) < 15.0  # around the nearer end
+    assert max(y for _, y in places) < 7.0
     # Without the map what is not seen is taken for free.
-    blind = Navigator(AT_ONCE).advise(seen(AT_ORIGIN, wall), ALL, given, (0.0, 0.0), 0.0)
+    blind = Navigator(AT_ONCE).advise(seen(AT_ORIGIN, wall), ALL, ((2.5, 0.0),) * 2, (0.0, 0.0), 0.0)
     assert abs(blind.waypoints[0][1]) < 4.0
+
+
+def test_a_way_out_of_a_long_dead_end_is_kept_to_until_the_straight_way_is_free() -> None:
+    """Once it is more than 3.6 m from the end wall, only the map knows that it is there."""
+    walls = np.array([[0.0, -0.8, 6.0, -0.8], [0.0, 0.8, 6.0, 0.8], [6.0, -0.8, 6.0, 0.8]])
+    places = follow(walls, (5.4, 0.0), (7.5, 0.0))
+    assert math.dist(places[-1], (7.5, 0.0)) < 0.1
+    assert length_m(places) < 17.0
+
+
+def test_no_way_around_is_so_long_that_one_through_a_wall_seems_shorter() -> None:
+    """Two places 1 m apart on both sides of a wall that is open at its far end alone."""
+    walls = [[-9.0, -9.0, 9.0, -9.0], [9.0, -9.0, 9.0, 9.0], [9.0, 9.0, -9.0, 9.0], [-9.0, 9.0, -9.0, -9.0]]
+    points = StaticLayer.of_shapes(np.array([*walls, [0.0, -9.0, 0.0, 8.0]])).around(AT_ORIGIN, 10.0)
+    clearances = clearances_around((0.0, 0.0), points, 20.0, LocalMapSettings())
+    corners = plan_detour(clearances, (-0.5, -8.0), (0.5, -8.0), 0.27)
+    assert corners[-1] == (0.5, -8.0)
+    assert 32.0 < length_m([(-0.5, -8.0), *corners]) < 36.0
 
 
 # ------------------------------------------------------------------------------------------------ policy and driver
@@ -140,13 +180,34 @@ def policy() -> Policy:
 def test_a_policy_with_a_map_is_told_where_it_is() -> None:
     driver = policy()
     assert "give pose=" in str(driver.act(OPEN, AHEAD, STANDING).reason)
-    assert "pose (nan" in str(driver.act(OPEN, AHEAD, STANDING, pose=(math.nan, 0.0, 0.0)).reason)
-    assert "pose has shape [2]" in str(driver.act(OPEN, AHEAD, STANDING, pose=(0.0, 0.0)).reason)
+    for wrong in ((math.nan, 0.0, 0.0), (0.0, 0.0)):
+        assert "three finite numbers" in str(driver.act(OPEN, AHEAD, STANDING, pose=wrong).reason)
+    assert "more than two turns" in str(driver.act(OPEN, AHEAD, STANDING, pose=(0.0, 0.0, 90.0)).reason)
     assert not driver.act(OPEN, AHEAD, STANDING, pose=AT_ORIGIN).stopped
     assert not Policy(agent()).act(OPEN, AHEAD, STANDING).stopped
     copied = copy.copy(driver)
     assert copied.navigator is not driver.navigator
     assert copied.navigator.static_layer is driver.navigator.static_layer  # type: ignore[union-attr]
+
+
+def test_the_stop_zone_minds_the_map_when_a_command_is_repeated_and_says_so() -> None:
+    """A scanner at half the pace of the loop: every second call has the scan of the one before."""
+    driver = policy()
+    told = []
+    for call in range(8):
+        now = 100.0 + 0.14 * call
+        scanned = 100.0 + 0.28 * (call // 2)
+        # 4 cm before the pane, as far as the map says: every way ahead ends at it.
+        pose = (1.5 - 0.29, 0.0, 0.0)
+        told.append(driver.act(OPEN, AHEAD, [0.3, 0.0], stamps=Stamps(now, scanned, now, now), pose=pose))
+    assert [each.fresh for each in told] == [True, False] * 4
+    for each in told:
+        assert each.v_m_per_s <= 0.0 or each.reason is not None
+    limited = [each.reason for each in told if each.reason is not None]
+    assert len(limited) == len([each for each in told if each.wanted[0] > 0.0])
+    assert all("around what the map shows" in reason for reason in limited)
+    seen_too = driver.act(np.full(180, 0.29), AHEAD, [0.3, 0.0], pose=(-9.0, 0.0, 0.0))
+    assert "map" not in str(seen_too.reason)
 
 
 def grid(frame: str = "odom", **changes: Any) -> SimpleNamespace:
@@ -168,6 +229,18 @@ def test_an_occupancy_grid_is_read_and_a_broken_one_refused() -> None:
         static_layer_of(grid(height=30))
 
 
+@pytest.mark.parametrize("kind", [np.int8, np.uint8, bytes, bytearray, array])
+def test_cells_are_percentages_in_whatever_bytes_they_come(kind: Any) -> None:
+    message = grid()
+    cells = np.array(message.data, np.int8)
+    if kind in (np.int8, np.uint8):
+        message.data = cells.view(kind)
+    else:
+        message.data = kind("b", cells.tobytes()) if kind is array else kind(cells.tobytes())
+    there, same = (static_layer_of(each).around(AT_ORIGIN, 10.0) for each in (grid(), message))
+    assert np.array_equal(there, same)
+
+
 def commanded(driver: Driver, now_s: float) -> str:
     driver.on_odometry(odometry(now_s, 0.0, 0.0))
     driver.on_scan(laser(now_s))
@@ -175,21 +248,30 @@ def commanded(driver: Driver, now_s: float) -> str:
 
 
 def test_a_driver_with_detours_keeps_clear_of_the_map_that_comes() -> None:
-    driver = Driver(Policy(agent()), detours=True)
+    driver = Driver(Policy(agent()), detours=True, mount=Mount())
     driver.on_path(path([(5.0, 0.0)]))
     commanded(driver, 100.0)
-    advice = driver.policy._advice
-    assert advice is not None
-    assert advice.distances_m[0] == pytest.approx(2.0)
+    navigator = driver.policy.navigator
+    assert navigator is not None
+    assert driver.lacks_map
+    assert navigator._far is None
     driver.on_map(grid())
     commanded(driver, 100.14)
-    assert driver.policy._advice.distances_m[0] == pytest.approx(1.0, abs=0.01)  # type: ignore[union-attr]
+    assert not driver.lacks_map
+    assert navigator._map.distance_m(0.9, 0.0) == pytest.approx(0.1, abs=0.05)
     driver.on_map(grid("map"))
-    assert "the map is in frame 'map', the path in 'odom'" in commanded(driver, 100.28)
+    assert "the map is in frame 'map', odometry in 'odom': no transform" in commanded(driver, 100.28)
+    # The map lies 4 m behind the robot, turned around: its wall is 5 m behind.
+    driver.on_transforms(tf(100.4, "map", "odom", RigidTransform.planar(4.0, 0.0, math.pi)))
+    commanded(driver, 100.42)
+    assert navigator._map.distance_m(0.9, 0.0) > 0.5
+    assert navigator.static_layer is not None
+    x, _ = navigator.static_layer.around((4.0, 0.0, math.pi), 5.0).T
+    assert (x.min(), x.max()) == pytest.approx((2.9, 3.0))
     driver.on_map(grid(width=7))
-    assert "the map cannot be read (the map says 40 x 7 cells" in commanded(driver, 100.42)
+    assert "the map cannot be read (the map says 40 x 7 cells" in commanded(driver, 100.56)
     driver.on_map(grid())
-    assert "map" not in commanded(driver, 100.56)
+    assert "map" not in commanded(driver, 100.7)
 
 
 def test_a_driver_without_detours_needs_no_map() -> None:

@@ -42,7 +42,7 @@ import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
-from rcdsac_trl.deploy.ros.topics import DRIVING, readers_of, without_numbers, writers_of
+from rcdsac_trl.deploy.ros.topics import DRIVING, no_map_on, readers_of, without_numbers, writers_of
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.sectors import Mount
 
@@ -171,6 +171,9 @@ class PolicyNode(Node):
         for topic, needed in self._needed.items():
             writers = [found.topic_type for found in self.get_publishers_info_by_topic(topic)]
             said.append(writers_of(topic, needed, writers) or "")
+        if self.driver.lacks_map:
+            writers = [found.topic_type for found in self.get_publishers_info_by_topic("map")]
+            said.append(no_map_on("map", writers))
         report = "; ".join(filter(None, said))
         if report != self._reported:
             self.get_logger().info(report)

@@ -112,12 +112,13 @@ class RobotFrames:
         """
         self._pose = named(frame), stamp_s, RigidTransform.planar(*pose)
 
-    def robot_in(self, frame: str, now_s: float) -> tuple[tuple[float, float, float], float]:
+    def robot_in(self, frame: str, now_s: float, what: str = "path") -> tuple[tuple[float, float, float], float]:
         """Return the robot's pose in a frame that stands still, by the newest of every transform.
 
         Args:
             frame: of a plan.
             now_s: time of the clock that stamps.
+            what: is in that frame, for the sentence of a refusal.
 
         Returns:
             x and y in m and yaw in rad, and the stamp of the odometry in it.
@@ -128,7 +129,7 @@ class RobotFrames:
         frame = named(frame)
         if self.transforms.hangs_below(frame, self._base_frame):
             raise TransformError(
-                f"the path is in frame {frame!r}, which moves with the robot: plan in one that stands still, such as "
+                f"the {what} is in frame {frame!r}, which moves with the robot: plan in one that stands still, such as "
                 "map or odom"
             )
         pose_s = min(self._newest_odometry_s(), now_s)
@@ -137,7 +138,7 @@ class RobotFrames:
             raise TransformError(f"the transform {link} is {now_s - pose_s:.2f} s old, more than {self._max_age_s:g} s")
         robot = self._robot_at(pose_s)
         if frame != self._odom_frame:
-            robot = self._correction(frame, now_s) @ robot
+            robot = self._correction(frame, now_s, what) @ robot
         return robot.pose, pose_s
 
     def sensor(
@@ -194,16 +195,16 @@ class RobotFrames:
             return self.transforms.lookup(self._odom_frame, self._base_frame, stamp_s, hold_s=math.inf)
         return self._odometry.lookup(_START, _ROBOT, stamp_s, hold_s=math.inf)
 
-    def _correction(self, frame: str, now_s: float) -> RigidTransform:
+    def _correction(self, frame: str, now_s: float, what: str) -> RigidTransform:
         """Return what takes the frame of odometry to that of a plan, unless it is missing or old."""
         if self._settings.localisation == "pose":
-            self._take_pose_over(frame)
+            self._take_pose_over(frame, what)
         transforms = self._localised if self._settings.localisation == "pose" else self.transforms
         try:
             correction, stamp_s = transforms.latest(frame, self._odom_frame)
         except TransformError as error:
             raise TransformError(
-                f"the path is in frame {frame!r}, odometry in {self._odom_frame!r}: {error}; start the localisation, "
+                f"the {what} is in frame {frame!r}, odometry in {self._odom_frame!r}: {error}; start the localisation, "
                 "or send both in one frame"
             ) from error
         link, timeout_s = transforms.oldest_link(frame, self._odom_frame), self._settings.localisation_timeout_s
@@ -219,10 +220,10 @@ class RobotFrames:
             )
         return correction
 
-    def _take_pose_over(self, frame: str) -> None:
+    def _take_pose_over(self, frame: str, what: str) -> None:
         """Keep what the newest pose says of the frame of odometry: a pose holds at its stamp, a correction stays."""
         if self._pose is None:
-            raise TransformError(f"the path is in frame {frame!r}, and no pose of the robot has come yet")
+            raise TransformError(f"the {what} is in frame {frame!r}, and no pose of the robot has come yet")
         of_frame, stamp_s, pose = self._pose
         if stamp_s > self._taken_s(of_frame):
             correction = pose @ self._robot_at(stamp_s).inverse()

@@ -14,8 +14,8 @@ Place = tuple[float, float]
 _COARSER = 2
 # What a metre costs more where nothing is left beside the robot; it falls as a square to 0 at this gap, m.
 _NEAR_PRICE, _NEAR_M = 3.0, 0.3
-# What a metre costs through something: finite, since the robot itself may stand there.
-_BLOCKED_PRICE = 50.0
+# What a metre costs through something: finite, since the robot itself may stand there, and more than any way around.
+_BLOCKED_PRICE = 1000.0
 # A way is blocked where it comes nearer than the robot's radius by more than this: half a cell and its diagonal.
 _SLACK_M = 0.03
 

@@ -1,8 +1,8 @@
 """What stands between a path and an agent: other waypoints where the way is blocked, and ways out of a standstill.
 
 It knows what an agent knows: ranges, the next two waypoints, velocities. All that it remembers is in the frame of the
-odometry, so a localisation that corrects itself changes nothing. It may be given a map besides, and where the robot is
-on it.
+odometry, so a localisation that corrects itself changes nothing of it. It may be given a map besides, and where the
+robot is on it: what that shows moves with every correction.
 """
 
 import math
@@ -71,7 +71,6 @@ class Advice(NamedTuple):
         boldness: how far beta is to be turned from what was asked for to its boldest, in [0, 1].
         draws: whether the action is to be drawn instead of its mean.
         instead: velocities to drive with whatever the agent wants, m/s and rad/s; None: the agent drives.
-        distances_m: what is known of all sectors, those not sensed from memory, float64 [180].
         been: where the robot has been while it drove ahead, in its frame now, float64 [k, 2], m.
     """
 
@@ -79,7 +78,6 @@ class Advice(NamedTuple):
     boldness: float
     draws: bool
     instead: tuple[float, float] | None
-    distances_m: NDArray[np.float64]
     been: NDArray[np.float64]
 
 
@@ -119,7 +117,8 @@ class Navigator:
         self._map = LocalMap(LocalMapSettings(memory_s=self.settings.memory_s), nothing, max_range_m)
         self._tracks = MoverTracks(TrackSettings(), nothing, max_range_m)
         self._trail: deque[Place] = deque(maxlen=_TRAIL_PLACES)
-        self._on_map: Pose | None = None
+        self._far: Clearances | None = None
+        self._far_s = 0.0
         self._blocked_s = self._planned_s = 0.0
         self._detour: list[Place] = []
         self._watchdog = None if self.settings.watchdog is None else Watchdog(self.settings.watchdog)
@@ -144,8 +143,8 @@ class Navigator:
             pose: of the robot in the frame of the static layer, x and y in m and yaw in rad; None: nothing is known of
                 the map around it.
         """
-        self._on_map = pose
-        self._observe(distances_m, covered, velocity, elapsed_s)
+        self._observe(distances_m, covered, velocity, elapsed_s, pose)
+        self._look_far(elapsed_s, pose)
         next_two = self._waypoints(waypoints, elapsed_s) if self.settings.replan else waypoints
         boldness, draws, instead = 0.0, False, None
         been = self._in_robot(np.array(self._trail))
@@ -154,7 +153,7 @@ class Navigator:
             self._watchdog.observe(self._map.place, target, elapsed_s)
             boldness, draws = self._watchdog.boldness, self._watchdog.draws
             instead = self._watchdog.way_out(self._map.place, been, next_two[0], elapsed_s)
-        return Advice(next_two, boldness, draws, instead, self._known(distances_m, covered), been)
+        return Advice(next_two, boldness, draws, instead, been)
 
     def _observe(
         self,
@@ -162,12 +161,13 @@ class Navigator:
         covered: NDArray[np.bool_],
         velocity: tuple[float, float],
         elapsed_s: float,
+        pose: Pose | None,
     ) -> None:
         seen_m = np.where(covered, distances_m, np.inf)
         self._map.sensed = covered
         self._map.move(*velocity, elapsed_s)
         self._tracks.observe(seen_m, self._map.pose, elapsed_s, covered)
-        standing = self._on_map_within(0.5 * self._map.settings.size_m)
+        standing = self._on_map_within(0.5 * self._map.settings.size_m, pose)
         self._map.observe(seen_m, self._tracks.moving, self._in_odometry(standing))
         # Only ahead: who backs a little beyond what it knows must not take that as known.
         ahead = (
@@ -180,7 +180,8 @@ class Navigator:
         """Return the next two waypoints, of a detour where the way to the first is blocked."""
         radius_m = self._robot.circumradius_m
         target, after = self._placed(waypoints[0]), self._placed(waypoints[1])
-        if is_clear(self._map.clearances, self._map.place, target, radius_m):
+        known = [self._map.clearances, *([] if self._far is None else [self._far])]
+        if all(is_clear(clearances, self._map.place, target, radius_m) for clearances in known):
             self._blocked_s = 0.0
             self._detour = []
             return waypoints
@@ -199,32 +200,43 @@ class Navigator:
 
     def _planned(self, target: Place, after: Place) -> list[Place]:
         """Return the corners of a way to the next waypoint, or past it where something stands on it; [] without one."""
-        clearances, here, radius_m = self._surroundings(), self._map.place, self._robot.circumradius_m
+        clearances = self._map.clearances if self._far is None else self._far
+        here, radius_m = self._map.place, self._robot.circumradius_m
         corners = plan_detour(clearances, here, target, radius_m)
         if not corners and math.dist(target, after) > _SAME_M:
             corners = plan_detour(clearances, here, after, radius_m)
         return corners
 
-    def _surroundings(self) -> Clearances:
-        """Return what detours are planned on: what is remembered, and far around it what the map shows."""
-        standing = self._on_map_within(0.5 * _WIDE_M)
+    def _look_far(self, elapsed_s: float, pose: Pose | None) -> None:
+        """Keep what detours are planned on: what is remembered, and far around it what the map shows."""
+        self._far_s += elapsed_s
+        standing = self._on_map_within(0.5 * _WIDE_M, pose)
         if not len(standing):
-            return self._map.clearances
-        points = np.concatenate([self._map.remembered, self._in_odometry(standing)])
-        return clearances_around(self._map.place, points, _WIDE_M, self._map.settings)
+            self._far = None
+        elif self._far is None or self._far_s >= _REPLAN_S:
+            points = np.concatenate([self._map.remembered, self._in_odometry(standing)])
+            self._far, self._far_s = clearances_around(self._map.place, points, _WIDE_M, self._map.settings), 0.0
 
-    def _on_map_within(self, reach_m: float) -> NDArray[np.float64]:
-        """Return the edges that the map shows in a square around the robot, in its frame, m, [k, 2]."""
-        if self.static_layer is None or self._on_map is None:
+    def _on_map_within(self, reach_m: float, pose: Pose | None) -> NDArray[np.float64]:
+        """Return the edges that the map shows in a square around a pose on it, in the robot's frame, m, [k, 2]."""
+        if self.static_layer is None or pose is None:
             return np.empty((0, 2))
-        return self.static_layer.around(self._on_map, reach_m)
+        return self.static_layer.around(pose, reach_m)
 
-    def _known(self, distances_m: NDArray[np.float64], covered: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the distances of all sectors, from memory where they are not sensed."""
+    def known(
+        self, distances_m: NDArray[np.float64], covered: NDArray[np.bool_], pose: Pose | None
+    ) -> NDArray[np.float64]:
+        """Return what is known of all sectors: seen, remembered where they are not, or on the map; m, float64 [180].
+
+        Args:
+            distances_m: of the range sensor, as in :meth:`advise`.
+            covered: likewise.
+            pose: likewise.
+        """
         remembered_m = self._nearest_m(self._in_robot(self._map.remembered))
         known_m = np.where(covered, distances_m, remembered_m)
         # On the map is what no sensor sees, too.
-        return np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M)))
+        return np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M, pose)))
 
     def _nearest_m(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far the nearest of points in the robot's frame is, by sector, float64 [180]; ``inf``: none."""

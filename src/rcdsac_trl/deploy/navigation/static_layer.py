@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.errors import UserInputError
 
 Pose = tuple[float, float, float]
@@ -16,8 +17,10 @@ Pose = tuple[float, float, float]
 # Points along an edge are at most so far apart, m: half a cell of the local map.
 _SPACING_M = 0.025
 _NO_CIRCLES = np.empty((0, 3))
-# Of a larger map it is not known where its numbers come from, nor would it be fast.
+# A building of 500 x 500 m has fewer; of more it would not be fast.
 _MOST_POINTS = 5_000_000
+# Larger cells are in another unit.
+_LARGEST_CELL_M = 5.0
 
 
 class StaticLayer:
@@ -37,13 +40,8 @@ class StaticLayer:
     """
 
     def __init__(self, points: NDArray[np.float64]) -> None:
-        points = np.asarray(points, np.float64)
-        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
-            raise UserInputError(f"points of a map, {points.shape}, are not finite numbers [k, 2]: give x and y in m")
-        if len(points) > _MOST_POINTS:
-            raise UserInputError(
-                f"a map has {len(points)} points on its edges, above {_MOST_POINTS}: give a part of it"
-            )
+        points = _rows(points, 2, "points")
+        _check_number_of_points(len(points))
         # In the order of x: what is near is then found without looking at all of a large building.
         self._points = points[np.argsort(points[:, 0], kind="stable")]
 
@@ -58,7 +56,15 @@ class StaticLayer:
         Args:
             segments: x0, y0, x1, y1 in m, map frame, [n, 4].
             circles: x, y and radius in m, [m, 3].
+
+        Raises:
+            UserInputError: if they are not such numbers, or have more than five million points.
         """
+        segments, circles = _rows(segments, 4, "segments"), _rows(circles, 3, "circles")
+        if (circles[:, 2] <= 0.0).any():
+            raise UserInputError(f"circles have a radius of {circles[:, 2].min():g} m: give one above 0")
+        ends_m = segments[:, 2:] - segments[:, :2]
+        _check_number_of_points((np.hypot(*ends_m.T).sum() + 2.0 * math.pi * circles[:, 2].sum()) / _SPACING_M)
         parts = [np.empty((0, 2))]
         for x0, y0, x1, y1 in segments.tolist():
             parts.append(np.linspace((x0, y0), (x1, y1), _number_of_points(math.hypot(x1 - x0, y1 - y0))))
@@ -77,20 +83,26 @@ class StaticLayer:
             origin: pose of the grid's lower left corner, x and y in m and yaw in rad, map frame.
 
         Raises:
-            UserInputError: if the cells have no size, or the layer would have more than five million points.
+            UserInputError: if these are not such values, or the layer would have more than five million points.
         """
-        if not 0.0 < cell_m < math.inf:
-            raise UserInputError(f"cells of a map have a side of {cell_m:g} m: give one above 0")
-        padded = np.pad(np.asarray(occupied, np.bool_), 1)
+        occupied = np.asarray(occupied)
+        if occupied.dtype != np.bool_ or occupied.ndim != 2:
+            raise UserInputError(
+                f"cells of a map are {occupied.dtype} {list(occupied.shape)}: say of each whether it is occupied, bool "
+                "[h, w], such as grid >= 65"
+            )
+        if not 0.0 < cell_m <= _LARGEST_CELL_M:
+            raise UserInputError(
+                f"cells of a map have a side of {cell_m:g}: give metres, above 0, {_LARGEST_CELL_M:g} at most"
+            )
+        if not all(map(math.isfinite, origin)):
+            raise UserInputError(f"the origin of a map, {origin}, is not finite: give x and y in m and yaw in rad")
+        padded = np.pad(occupied, 1)
         # A side between two cells is an edge where one alone is occupied; corners are counted in cells.
         below = np.argwhere(padded[1:] != padded[:-1]) - (0, 1)
         beside = np.argwhere(padded[:, 1:] != padded[:, :-1]) - (1, 0)
         along = np.linspace(0.0, 1.0, _number_of_points(cell_m))
-        if (len(below) + len(beside)) * len(along) > _MOST_POINTS:
-            raise UserInputError(
-                f"a map has {len(below) + len(beside)} sides of cells on its edges, more than a layer holds: give a "
-                "part of it, or a coarser one"
-            )
+        _check_number_of_points((len(below) + len(beside)) * len(along))
         x = np.concatenate([(below[:, 1:] + along).ravel(), np.repeat(beside[:, 1], len(along))]) * cell_m
         y = np.concatenate([np.repeat(below[:, 0], len(along)), (beside[:, :1] + along).ravel()]) * cell_m
         x0, y0, yaw = origin
@@ -119,3 +131,24 @@ class StaticLayer:
 def _number_of_points(length_m: float) -> int:
     """Return how many points along an edge are near enough to each other, both ends among them."""
     return max(2, math.ceil(length_m / _SPACING_M) + 1)
+
+
+def _check_number_of_points(number: float) -> None:
+    if not number <= _MOST_POINTS:
+        raise UserInputError(
+            f"a map has {number:.0f} points on its edges, above {_MOST_POINTS}: give a part of it, and metres"
+        )
+
+
+def _rows(values: NDArray[np.float64], columns: int, name: str) -> NDArray[np.float64]:
+    """Return a table of finite numbers.
+
+    Raises:
+        UserInputError: if it is none.
+    """
+    table = numbers_of(values, name)
+    if table.ndim != 2 or table.shape[1] != columns or not np.isfinite(table).all():
+        raise UserInputError(
+            f"{name} of a map, {list(table.shape)}, are not finite numbers [n, {columns}]: give metres"
+        )
+    return table

@@ -163,7 +163,7 @@ class Driver:
             self._faults["pose"] = f"the robot's pose cannot be read ({described(error)})"
 
     def on_map(self, message: Any) -> None:
-        """Take a ``nav_msgs/OccupancyGrid``, in the frame of the path; it means nothing without a navigator."""
+        """Take a ``nav_msgs/OccupancyGrid``; it means nothing without a navigator."""
         if self.policy.navigator is None:
             return
         self._faults.pop("map", None)
@@ -171,9 +171,14 @@ class Driver:
             self.policy.navigator.static_layer = messages.static_layer_of(message)
             self._map_frame = str(message.header.frame_id)
         except UserInputError as error:
-            self._faults["map"] = f"the map cannot be read ({error})"
+            self._faults["map"] = _unreadable_map(str(error))
         except Exception as error:  # as in on_cloud()
-            self._faults["map"] = f"the map cannot be read ({described(error)})"
+            self._faults["map"] = _unreadable_map(described(error))
+
+    @property
+    def lacks_map(self) -> bool:
+        """Whether a map would be of use, and none has come."""
+        return self.policy.navigator is not None and self.policy.navigator.static_layer is None
 
     def on_path(self, message: Any) -> None:
         """Take a ``nav_msgs/Path``; the goal is its last pose. One without poses means: stand."""
@@ -229,16 +234,14 @@ class Driver:
             return self.policy.refuse("the goal is reached")
         if (missing := self._missing()) is not None:
             return self.policy.refuse(missing)
-        if self._map_frame not in ("", self._path_frame):
-            return self.policy.refuse(
-                f"the map is in frame {self._map_frame!r}, the path in {self._path_frame!r}: plan on that map, or give "
-                "the node none"
-            )
         ranges, scanned_s = self._ranges(pose_s)
         stamps = Stamps(now_s, scanned_s, pose_s, moved_s)
         velocity = messages.velocity_of_odometry(self._odometry)
         self.situation = Situation(here, waypoints, ranges, velocity)
-        return self.policy.act(ranges, waypoints, velocity, self.beta, stamps=stamps, pose=here)
+        on_map = here
+        if self._map_frame not in ("", self._path_frame):
+            on_map, _ = self._frames.robot_in(self._map_frame, now_s, "map")
+        return self.policy.act(ranges, waypoints, velocity, self.beta, stamps=stamps, pose=on_map)
 
     def _located(self, now_s: float) -> tuple[tuple[float, float, float], float, float]:
         """Return the robot's pose in the path's frame, the stamp of that pose, and the stamp of the odometry."""
@@ -283,3 +286,7 @@ class Driver:
             there = self._frames.sensor(frame, stamps[-1], pose_s, given)
             clouds.append((messages.points_of(message), camera_of(there, camera, frame)))
         return cloud_sectors(clouds, self._filter, self._robot.lidar.max_range_m), min(stamps)
+
+
+def _unreadable_map(why: str) -> str:
+    return f"the map cannot be read ({why}); publish another one, or drive without detours"

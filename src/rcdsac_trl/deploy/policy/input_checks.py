@@ -259,18 +259,6 @@ def velocity_of(velocity: Any, robot: RobotSettings = PAPER) -> tuple[float, flo
     return v, omega
 
 
-def pose_of(pose: Any) -> tuple[float, float, float]:
-    """Return a pose on a map, x and y in m and yaw in rad.
-
-    Raises:
-        BadInputError: if it is none.
-    """
-    x, y, yaw = _array(pose, (3,), "pose").tolist()
-    if not all(math.isfinite(value) for value in (x, y, yaw)):
-        raise BadInputError(f"pose ({x:g}, {y:g}, {yaw:g}) is not finite: give x and y in metres and yaw in radians")
-    return x, y, yaw
-
-
 def _array(value: Any, shape: tuple[int, ...] | None, name: str) -> NDArray[np.float64]:
     array = numbers_of(value, name)
     if shape is not None and array.shape != shape:

@@ -100,7 +100,7 @@ class PathFollower:
         Raises:
             UserInputError: if the pose is none, or farther from the path than 75 m.
         """
-        x, y, yaw = _checked(pose)
+        x, y, yaw = checked_pose(pose)
         _check_near(self._planned or self._line, (x, y))
         if self._planned is not None:
             self._take_over(self._planned, (x, y))
@@ -260,7 +260,12 @@ def _check_near(line: Polyline, here: tuple[float, float]) -> None:
         )
 
 
-def _checked(pose: Any) -> tuple[float, float, float]:
+def checked_pose(pose: Any) -> tuple[float, float, float]:
+    """Return a pose on a map, x and y in m and yaw in rad.
+
+    Raises:
+        UserInputError: if it is none, or in other units.
+    """
     numbers = numbers_of(pose, "a pose's numbers")
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise UserInputError(f"the pose {numbers.tolist()} is not three finite numbers: give x, y in metres and yaw")

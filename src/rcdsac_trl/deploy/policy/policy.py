@@ -19,13 +19,13 @@ from rcdsac_trl.deploy.policy.input_checks import (
     Stamps,
     as_given_now,
     check_stamps,
-    pose_of,
     sectors_of,
     velocity_of,
     waypoints_of,
 )
 from rcdsac_trl.deploy.policy.model_card import summary
 from rcdsac_trl.deploy.policy.observed import observed
+from rcdsac_trl.deploy.policy.path import checked_pose
 from rcdsac_trl.deploy.policy.recurrent_networks import RecurrentNetworks
 from rcdsac_trl.deploy.policy.robot_observer import RobotObserver
 from rcdsac_trl.deploy.policy.weights import Weights
@@ -338,7 +338,7 @@ class Policy:
             return None
         if pose is None:
             raise BadInputError("the navigator has a map, and act() was not told where on it the robot is: give pose=")
-        return pose_of(pose)
+        return checked_pose(pose)
 
     def _drive(
         self,
@@ -362,7 +362,7 @@ class Policy:
                 )
                 next_two, context = self._advice.waypoints, bolder(self.config, context, self._advice.boldness)
             self._see(*self._observer.observe(sectors, next_two, measured, elapsed_s), context)
-        return self._command(sectors, measured, fresh, fresh and forgot)
+        return self._command(sectors, measured, fresh, fresh and forgot, on_map)
 
     def _see(
         self, bins: NDArray[np.float32], vectors: Sequence[float] | NDArray[np.float32], context: float | None
@@ -374,26 +374,41 @@ class Policy:
         self._told = self._networks.see(bins, vectors, context, noise)
         return self._told
 
-    def _command(self, sectors: Sectors, measured: tuple[float, float], fresh: bool, forgot: bool) -> Command:
+    def _command(
+        self,
+        sectors: Sectors,
+        measured: tuple[float, float],
+        fresh: bool,
+        forgot: bool,
+        on_map: "Pose | None",
+    ) -> Command:
         outlook = self._told
         assert outlook is not None
         (v, omega), reason, been = outlook.wanted, None, None
         told = None
         if self._advice is not None:
-            if fresh:
-                sectors = replace(sectors, distances_m=self._advice.distances_m)
             been = self._advice.been
             if self._advice.instead is not None:
                 v, omega = self._advice.instead
                 told = "it got nowhere and backs off; the agent drives on then"
         if self.guard is not None:
-            v, omega, reason = self.guard.limit(v, omega, sectors, measured, been)
+            wish = v, omega
+            v, omega, reason = self.guard.limit(*wish, self._known(sectors, on_map), measured, been)
+            if on_map is not None and reason and not self.guard.limit(*wish, self._known(sectors), measured, been)[2]:
+                reason += " around what the map shows"
         # Networks are told what the robot was told: the limits are part of the world.
         self._observer.commanded = (v, omega)
         if reason is not None:
             told = f"limited by {reason}; it ends when the cause does"
         quantiles, value, raw = outlook.quantiles, outlook.value, outlook.raw_quantiles
         return Command(v, omega, False, told, outlook.wanted, quantiles, value, fresh, forgot, raw)
+
+    def _known(self, sectors: Sectors, on_map: "Pose | None" = None) -> Sectors:
+        """Return what the stop zone minds: what is sensed, and what the navigator knows besides."""
+        if self.navigator is None:
+            return sectors
+        known_m = self.navigator.known(sectors.distances_m, sectors.covered, on_map)
+        return replace(sectors, distances_m=known_m)
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""

@@ -24,7 +24,7 @@ from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros import dds_types
 from rcdsac_trl.deploy.ros.messages import seconds_of, twist, twist_stamped
-from rcdsac_trl.deploy.ros.topics import DRIVING, readers_of, writers_of
+from rcdsac_trl.deploy.ros.topics import DRIVING, no_map_on, readers_of, writers_of
 from rcdsac_trl.errors import UserInputError
 
 READS: dict[str, Any] = {
@@ -167,6 +167,8 @@ class DdsBridge:
             matched = bool(reader.get_matched_publications())
             writers = self._types(topic, "writers")
             said.append(writers_of(f"/{topic}", _type_name(kind), writers, matched=matched) or "")
+        if self.driver.lacks_map:
+            said.append(no_map_on(f"/{self.topics['map']}", self._types(self.topics["map"], "writers")))
         return "; ".join(filter(None, said))
 
     def _types(self, topic: str, who: str) -> list[str]:

@@ -5,6 +5,7 @@ raise :class:`~rcdsac_trl.errors.UserInputError`.
 """
 
 import math
+from array import array
 from collections.abc import Callable
 from typing import Any
 
@@ -23,8 +24,8 @@ from rcdsac_trl.robot.sectors import Mount, is_finite_number
 _ANGLE_SLACK_RAYS, _ANGLE_SLACK_SHARE = 2.0, 0.05
 # builtin_interfaces/Time holds whole seconds in 32 bits.
 _LAST_STAMP_S = 2.0**31
-# From so many percent on, a cell of a nav_msgs/OccupancyGrid is occupied; -1 is unknown.
-_OCCUPIED_PERCENT = 65
+# A cell of a nav_msgs/OccupancyGrid that is occupied with so much probability is; -1 is unknown.
+_OCCUPIED_PERCENT = (65, 100)
 # sensor_msgs/PointField: number of a type to NumPy's.
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -175,12 +176,22 @@ def static_layer_of(message: Any) -> StaticLayer:
     """
     info = message.info
     width, height = int(info.width), int(info.height)
-    cells = numbers_of(message.data, "the map's cells")
+    cells = _cells_of(message.data)
     if cells.shape != (width * height,):
         raise UserInputError(f"the map says {height} x {width} cells and has {cells.size}: its sender is broken")
     origin = float(info.origin.position.x), float(info.origin.position.y), _yaw(info.origin.orientation)
-    occupied = cells.reshape(height, width) >= _OCCUPIED_PERCENT
+    low, high = _OCCUPIED_PERCENT
+    occupied = ((cells >= low) & (cells <= high)).reshape(height, width)
     return StaticLayer.of_cells(occupied, float(info.resolution), origin)
+
+
+def _cells_of(data: Any) -> NDArray[Any]:
+    """Return the cells of an occupancy grid: of bytes, which are read at once, or of a list, which takes longer."""
+    if isinstance(data, bytes | bytearray | memoryview | array):
+        return np.frombuffer(data, np.int8)
+    if isinstance(data, np.ndarray) and data.dtype.itemsize == 1:
+        return data.view(np.int8)
+    return numbers_of(data, "the map's cells")
 
 
 def twist_stamped(command: Command, now_s: float, make: Callable[[str], Any], *, frame_id: str = "base_link") -> Any:

@@ -34,6 +34,22 @@ def writers_of(topic: str, kind: str, writers: Sequence[str], *, matched: bool =
     return None
 
 
+def no_map_on(topic: str, writers: Sequence[str]) -> str:
+    """Return why a node that would use a map has none.
+
+    Args:
+        topic: its name.
+        writers: the type of each of its writers.
+
+    Example:
+        >>> no_map_on("/map", [])
+        'nobody writes /map: detours know what was seen alone'
+    """
+    if not writers:
+        return f"nobody writes {topic}: detours know what was seen alone"
+    return f"{topic} is written, and none has come: its writer must be reliable and transient local"
+
+
 def readers_of(topic: str, kinds: Sequence[str], readers: Sequence[str]) -> str:
     """Return who reads a topic that a node writes.
 
