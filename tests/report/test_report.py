@@ -377,6 +377,16 @@ def test_what_beta_does_is_said_in_words_on_axes_from_zero(tmp_path: Path, seeds
     assert reward.get_ylim()[0] <= 0.0
 
 
+def test_agents_for_one_beta_each_are_not_joined_by_a_line(tmp_path: Path) -> None:
+    folders = [evaluate(tmp_path / "rc", "rcdsac_cvar", {0.25: 0, 0.75: 1}, measure="cvar")]
+    folders += [evaluate(tmp_path / f"{beta}", "dsac_cvar", {beta: 1}, measure="cvar") for beta in (0.25, 0.75)]
+    figure = beta_response(read_episodes(folders), "cvar")
+    assert figure is not None
+    styles = {line.get_label(): line.get_linestyle() for line in figure.axes[0].lines}
+    assert styles["RC-DSAC (resample) CVaR"] == "-"
+    assert styles["DSAC CVaR"] == "None"
+
+
 def test_controllers_collide_under_their_names(tmp_path: Path) -> None:
     """Also where only the fixed betas of another evaluation, or none of the controllers, did."""
     turned = with_controllers(tmp_path / "a", "rcdsac_pow", {-2.0: 2}, {"clearance": 0, "tail_variance": 1})

@@ -19,7 +19,7 @@ from rcdsac_trl.report.findings import TAILS, bounded, labels
 from rcdsac_trl.report.read import METRIC_NAMES, Episodes
 from rcdsac_trl.report.statistics import Interval, Statistic
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, PAPER, series, style
-from rcdsac_trl.report.table import called, condition_label, setting_label
+from rcdsac_trl.report.table import called, condition_label, has_dial, setting_label
 
 _TAIL = TAILS[0]
 # What follows beta, in four panels.
@@ -156,12 +156,19 @@ def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str
         if any(len(v) > 1 for v in values):
             _shade(axes, rows["beta"], [bounded(v, metric, statistic) for v in values], color, alpha=0.08)
         alone = [bounded(statistics.of_these_agents(v), metric, statistic) for v in values]
-        _shade(axes, rows["beta"], alone, color, alpha=0.22)
         middle = [interval.value for interval in alone]
-        axes.plot(rows["beta"], middle, color=color, marker=marker, markersize=6, linewidth=1.9, label=name)
+        means = [statistics.mean(v) for v in values]
+        if has_dial(rows.iloc[0]["agent"]):
+            _shade(axes, rows["beta"], alone, color, alpha=0.22)
+            axes.plot(rows["beta"], middle, color=color, marker=marker, markersize=6, linewidth=1.9, label=name)
+            if metric == "reward":
+                axes.plot(rows["beta"], means, color=color, linestyle="--", linewidth=1.2)
+        else:  # no line: each of them is another policy
+            axes.plot(rows["beta"], middle, color=color, marker=marker, markersize=7, linestyle="none", label=name)
+            axes.vlines(rows["beta"], [i.low for i in alone], [i.high for i in alone], color=color, linewidth=1.6)
+            if metric == "reward":
+                axes.plot(rows["beta"], means, color=color, marker="_", markersize=14, linestyle="none")
         _draw_turned(axes, episodes, rows.iloc[0], metric, statistic, color)
-        if metric == "reward":
-            axes.plot(rows["beta"], [statistics.mean(v) for v in values], color=color, linestyle="--", linewidth=1.2)
     style(axes, heading, "β")
     axes.set_xticks(sorted({beta for _, rows in groups for beta in rows["beta"]}))
     _include_zero(axes)

@@ -121,6 +121,16 @@ def row_label(agent: str) -> str:
     return " ".join(part for part in called(agent) if part)
 
 
+def has_dial(agent: str) -> bool:
+    """Return whether one policy of a row is driven at all its β; each of DSAC's is of another training.
+
+    Example:
+        >>> has_dial("rcdsac_cvar"), has_dial("dsac_cvar")
+        (True, False)
+    """
+    return called(agent)[0] != "DSAC"
+
+
 def _names() -> pd.DataFrame:
     """Return what the paper calls each of our rows, and the row's measure."""
     return paper_table()[["agent", "name", "psi"]].drop_duplicates()
