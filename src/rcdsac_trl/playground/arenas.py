@@ -16,6 +16,7 @@ from rcdsac_trl.evaluation.course.course_drive import Conditions, CourseWorld
 from rcdsac_trl.playground.drivers import Situation
 from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import distance_and_bearing
+from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.map_source import MapSource
@@ -282,9 +283,7 @@ class CourseArena:
     def scene(self) -> Scene:
         """Return what a picture of this moment shows; the next two waypoints are where the robot takes them to be."""
         simulation = self.simulation
-        x, y, yaw = simulation.pose
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        next_two = self._waypoints @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
+        next_two = placed(self._waypoints, simulation.pose)
         waypoints = np.concatenate([next_two, self._world.follower.ahead[2:]])
         return Scene(
             map=self.map,

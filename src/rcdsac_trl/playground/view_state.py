@@ -13,6 +13,7 @@ from rcdsac_trl.agent.risk import RiskMeasure
 from rcdsac_trl.playground.drivers import AgentDriver, Dial
 from rcdsac_trl.playground.play_drive import Robot
 from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.world.render import Scene
 
@@ -157,8 +158,8 @@ def robot_view(robot: Robot, scene: Scene, values: ValueView | None) -> RobotVie
         dial=robot.driver.dial,
         dialled=robot.dialled,
         pose=scene.pose,
-        body=_placed(body, scene.pose),
-        arrow=_placed(size * _ARROW, scene.pose),
+        body=placed(body, scene.pose),
+        arrow=placed(size * _ARROW, scene.pose),
         sensor=sensor_view(scene),
         way=np.concatenate([[(x, y)], scene.waypoints]),
         movers=scene.movers,
@@ -261,13 +262,6 @@ def _actions() -> NDArray[np.float32]:
     along = np.linspace(-1.0, 1.0, VALUES_A_SIDE, dtype=np.float32)
     turn, speed = np.meshgrid(along, along, indexing="ij")
     return np.stack([speed, turn], axis=-1).reshape(-1, 2)
-
-
-def _placed(points: Array, pose: tuple[float, float, float]) -> Array:
-    """Return points of a robot's frame in the map's, [n, 2]."""
-    x, y, yaw = pose
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return points @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
 
 
 def _in_degrees(v: float, omega: float) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,6 +38,11 @@ _MEASURES = {
     "cpw": "CPW",
     "var": "VaR",
 }
+# One policy over beta is a line; agents for one beta each are points.
+_LINE: dict[str, Any] = {"markersize": 6, "linewidth": 1.9}
+_POINTS: dict[str, Any] = {"markersize": 7, "linestyle": "none"}
+_MEAN_LINE: dict[str, Any] = {"linestyle": "--", "linewidth": 1.2}
+_MEAN_POINTS: dict[str, Any] = {"marker": "_", "markersize": 14, "linestyle": "none"}
 # What less of a metric is called, where it is counted.
 _LESS = {"collisions": "fewer", "goals": "fewer"}
 _LEARNT = ("reward", "collisions")
@@ -157,17 +163,15 @@ def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str
             _shade(axes, rows["beta"], [bounded(v, metric, statistic) for v in values], color, alpha=0.08)
         alone = [bounded(statistics.of_these_agents(v), metric, statistic) for v in values]
         middle = [interval.value for interval in alone]
-        means = [statistics.mean(v) for v in values]
         if has_dial(rows.iloc[0]["agent"]):
             _shade(axes, rows["beta"], alone, color, alpha=0.22)
-            axes.plot(rows["beta"], middle, color=color, marker=marker, markersize=6, linewidth=1.9, label=name)
-            if metric == "reward":
-                axes.plot(rows["beta"], means, color=color, linestyle="--", linewidth=1.2)
-        else:  # no line: each of them is another policy
-            axes.plot(rows["beta"], middle, color=color, marker=marker, markersize=7, linestyle="none", label=name)
+            dressed, mean_dressed = _LINE, _MEAN_LINE
+        else:
             axes.vlines(rows["beta"], [i.low for i in alone], [i.high for i in alone], color=color, linewidth=1.6)
-            if metric == "reward":
-                axes.plot(rows["beta"], means, color=color, marker="_", markersize=14, linestyle="none")
+            dressed, mean_dressed = _POINTS, _MEAN_POINTS
+        axes.plot(rows["beta"], middle, color=color, marker=marker, label=name, **dressed)
+        if metric == "reward":
+            axes.plot(rows["beta"], [statistics.mean(v) for v in values], color=color, **mean_dressed)
         _draw_turned(axes, episodes, rows.iloc[0], metric, statistic, color)
     style(axes, heading, "β")
     axes.set_xticks(sorted({beta for _, rows in groups for beta in rows["beta"]}))

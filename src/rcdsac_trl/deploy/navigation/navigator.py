@@ -19,6 +19,7 @@ from rcdsac_trl.deploy.navigation.static_layer import Pose, StaticLayer
 from rcdsac_trl.deploy.navigation.watchdog import Watchdog, WatchdogSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
+from rcdsac_trl.robot.planar import placed, seen_from
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import check_switches
@@ -147,7 +148,7 @@ class Navigator:
         self._look_far(elapsed_s, pose)
         next_two = self._waypoints(waypoints, elapsed_s) if self.settings.replan else waypoints
         boldness, draws, instead = 0.0, False, None
-        been = self._in_robot(np.array(self._trail))
+        been = seen_from(np.array(self._trail), self._map.pose)
         if self._watchdog is not None:
             target = self._placed(waypoints[0])
             self._watchdog.observe(self._map.place, target, elapsed_s)
@@ -168,7 +169,7 @@ class Navigator:
         self._map.move(*velocity, elapsed_s)
         self._tracks.observe(seen_m, self._map.pose, elapsed_s, covered)
         standing = self._on_map_within(0.5 * self._map.settings.size_m, pose)
-        self._map.observe(seen_m, self._tracks.moving, self._in_odometry(standing))
+        self._map.observe(seen_m, self._tracks.moving, placed(standing, self._map.pose))
         # Only ahead: who backs a little beyond what it knows must not take that as known.
         ahead = (
             velocity[0] > 0.0 and math.dist(self._trail[-1], self._map.place) > _TRAIL_STEP_M if self._trail else True
@@ -195,7 +196,7 @@ class Navigator:
             self._detour = self._detour[1:]
         if not self._detour:
             return waypoints
-        places = self._in_robot(np.array([*self._detour, after])).tolist()
+        places = seen_from(np.array([*self._detour, after]), self._map.pose).tolist()
         return (places[0][0], places[0][1]), (places[1][0], places[1][1])
 
     def _planned(self, target: Place, after: Place) -> list[Place]:
@@ -210,12 +211,13 @@ class Navigator:
     def _look_far(self, elapsed_s: float, pose: Pose | None) -> None:
         """Keep what detours are planned on: what is remembered, and far around it what the map shows."""
         self._far_s += elapsed_s
-        standing = self._on_map_within(0.5 * _WIDE_M, pose)
-        if not len(standing):
+        if self.static_layer is None or pose is None:
             self._far = None
         elif self._far is None or self._far_s >= _REPLAN_S:
-            points = np.concatenate([self._map.remembered, self._in_odometry(standing)])
-            self._far, self._far_s = clearances_around(self._map.place, points, _WIDE_M, self._map.settings), 0.0
+            standing = placed(self._on_map_within(0.5 * _WIDE_M, pose), self._map.pose)
+            points = np.concatenate([self._map.remembered, standing])
+            around = clearances_around(self._map.place, points, _WIDE_M, self._map.settings) if len(standing) else None
+            self._far, self._far_s = around, 0.0
 
     def _on_map_within(self, reach_m: float, pose: Pose | None) -> NDArray[np.float64]:
         """Return the edges that the map shows in a square around a pose on it, in the robot's frame, m, [k, 2]."""
@@ -233,7 +235,7 @@ class Navigator:
             covered: likewise.
             pose: likewise.
         """
-        remembered_m = self._nearest_m(self._in_robot(self._map.remembered))
+        remembered_m = self._nearest_m(seen_from(self._map.remembered, self._map.pose))
         known_m = np.where(covered, distances_m, remembered_m)
         # On the map is what no sensor sees, too.
         return np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M, pose)))
@@ -249,19 +251,5 @@ class Navigator:
 
     def _placed(self, point: Place) -> Place:
         """Return a point of the robot's frame in that of the odometry."""
-        ((x, y),) = self._in_odometry(np.array([point])).tolist()
+        ((x, y),) = placed(np.array([point]), self._map.pose).tolist()
         return x, y
-
-    def _in_odometry(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return points [k, 2] of the robot's frame in that of the odometry."""
-        x, y, yaw = self._map.pose.tolist()
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        placed: NDArray[np.float64] = points @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
-        return placed
-
-    def _in_robot(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return points [k, 2] of the odometry's frame in the robot's."""
-        x, y, yaw = self._map.pose.tolist()
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        turned: NDArray[np.float64] = (points.reshape(-1, 2) - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
-        return turned

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.planar import placed, seen_from
 
 Pose = tuple[float, float, float]
 
@@ -105,9 +106,7 @@ class StaticLayer:
         _check_number_of_points((len(below) + len(beside)) * len(along))
         x = np.concatenate([(below[:, 1:] + along).ravel(), np.repeat(beside[:, 1], len(along))]) * cell_m
         y = np.concatenate([np.repeat(below[:, 0], len(along)), (beside[:, :1] + along).ravel()]) * cell_m
-        x0, y0, yaw = origin
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        return cls(np.stack([x0 + cos * x - sin * y, y0 + sin * x + cos * y], axis=1))
+        return cls(placed(np.stack([x, y], axis=1), origin))
 
     def around(self, pose: Pose, reach_m: float) -> NDArray[np.float64]:
         """Return what is within a square around a robot, in its frame.
@@ -119,13 +118,10 @@ class StaticLayer:
         Returns:
             x and y in m, float64 [m, 2].
         """
-        x, y, yaw = pose
+        x, y, _ = pose
         first, last = np.searchsorted(self._points[:, 0], (x - reach_m, x + reach_m))
-        apart = self._points[first:last] - (x, y)
-        near = apart[np.abs(apart[:, 1]) < reach_m]
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        turned: NDArray[np.float64] = near @ np.array([[cos, -sin], [sin, cos]])
-        return turned
+        band = self._points[first:last]
+        return seen_from(band[np.abs(band[:, 1] - y) < reach_m], pose)
 
 
 def _number_of_points(length_m: float) -> int:

@@ -1,6 +1,7 @@
 """The core of a ROS 2 node without ROS: it takes messages as they come, and gives a command when asked."""
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,27 +154,17 @@ class Driver:
 
     def on_pose(self, message: Any) -> None:
         """Take a ``geometry_msgs/PoseWithCovarianceStamped`` of the robot."""
-        self._faults.pop("pose", None)
-        try:
+        with self._reading("robot's pose"):
             pose, at_s = messages.pose_of(message), messages.stamp_s(message)
             self._frames.localised(str(message.header.frame_id), at_s, pose)
-        except UserInputError as error:
-            self._faults["pose"] = f"the robot's pose cannot be read ({error})"
-        except Exception as error:  # as in on_cloud()
-            self._faults["pose"] = f"the robot's pose cannot be read ({described(error)})"
 
     def on_map(self, message: Any) -> None:
         """Take a ``nav_msgs/OccupancyGrid``; it means nothing without a navigator."""
         if self.policy.navigator is None:
             return
-        self._faults.pop("map", None)
-        try:
+        with self._reading("map", "; publish another one, or drive without detours"):
             self.policy.navigator.static_layer = messages.static_layer_of(message)
             self._map_frame = str(message.header.frame_id)
-        except UserInputError as error:
-            self._faults["map"] = _unreadable_map(str(error))
-        except Exception as error:  # as in on_cloud()
-            self._faults["map"] = _unreadable_map(described(error))
 
     @property
     def lacks_map(self) -> bool:
@@ -182,14 +173,20 @@ class Driver:
 
     def on_path(self, message: Any) -> None:
         """Take a ``nav_msgs/Path``; the goal is its last pose. One without poses means: stand."""
-        self._faults.pop("path", None)
         self._no_path = "there is no path"
-        try:
+        with self._reading("path"):
             self._follow(messages.path_of(message), str(message.header.frame_id))
+
+    @contextlib.contextmanager
+    def _reading(self, what: str, remedy: str = "") -> Iterator[None]:
+        """Let the robot stand for what cannot be read, until the next message of its kind can be."""
+        self._faults.pop(what, None)
+        try:
+            yield
         except UserInputError as error:
-            self._faults["path"] = f"the path cannot be read ({error})"
+            self._faults[what] = f"the {what} cannot be read ({error}){remedy}"
         except Exception as error:  # as in on_cloud()
-            self._faults["path"] = f"the path cannot be read ({described(error)})"
+            self._faults[what] = f"the {what} cannot be read ({described(error)}){remedy}"
 
     def _follow(self, path: NDArray[np.float64], frame: str) -> None:
         if not len(path):
@@ -286,7 +283,3 @@ class Driver:
             there = self._frames.sensor(frame, stamps[-1], pose_s, given)
             clouds.append((messages.points_of(message), camera_of(there, camera, frame)))
         return cloud_sectors(clouds, self._filter, self._robot.lidar.max_range_m), min(stamps)
-
-
-def _unreadable_map(why: str) -> str:
-    return f"the map cannot be read ({why}); publish another one, or drive without detours"

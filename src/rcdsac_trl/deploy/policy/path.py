@@ -10,6 +10,7 @@ from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.polyline import Polyline, corners
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.planar import seen_from
 from rcdsac_trl.robot.sectors import is_finite_number
 
 # Waypoints are at most this far ahead along the path: the maps of training are 20 m wide.
@@ -111,8 +112,7 @@ class PathFollower:
             self.reached = is_last and _apart(self._line.points[-1], (x, y)) < self._goal_m
         if self.reached:
             return None
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        return (self._two() - (x, y)) @ np.array([[cos, -sin], [sin, cos]])
+        return seen_from(self._two(), (x, y, yaw))
 
     @property
     def along_m(self) -> float:

@@ -9,6 +9,7 @@ from rcdsac_trl.config.course_settings import PERIOD_S
 from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.evaluation.course.course_drive import Pilot, Trace
 from rcdsac_trl.evaluation.film.video import Frame
+from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.world.office.building import Office
 from rcdsac_trl.world.render import Renderer, Scene
@@ -50,7 +51,7 @@ def frames(office: Office, pilot: Pilot, trace: Trace, course: NDArray[np.float6
             pose=_pose(trace.poses[step]),
             distances_m=trace.distances_m[step],
             sensor_mask=mask,
-            waypoints=_in_map(waypoints, trace.estimates[step]),
+            waypoints=placed(waypoints, trace.estimates[step]),
             movers=np.column_stack([trace.people[step], radii]),
             trail=[(x, y) for x, y in trace.poses[max(0, step - _TRAIL_STEPS) : step + 1, :2].tolist()],
             in_contact=bool(trace.in_contact[step]),
@@ -64,9 +65,3 @@ def frames(office: Office, pilot: Pilot, trace: Trace, course: NDArray[np.float6
 def _pose(row: NDArray[np.float64]) -> tuple[float, float, float]:
     x, y, yaw = row.tolist()
     return x, y, yaw
-
-
-def _in_map(points: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return points of the robot's frame in the map's, [n, 2]."""
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return points @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]

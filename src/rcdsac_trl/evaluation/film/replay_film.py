@@ -6,6 +6,7 @@ import numpy as np
 
 from rcdsac_trl.evaluation.film.video import Frame
 from rcdsac_trl.evaluation.recorded_drive import RecordedPeriod
+from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.world.maps.shapes import Map
@@ -34,8 +35,7 @@ def frames(periods: Sequence[RecordedPeriod]) -> Iterator[Frame]:
     for period in periods:
         if period.situation is not None and period.sectors is not None:
             pose, sectors = period.situation.pose, period.sectors
-            cos, sin = np.cos(pose[2]), np.sin(pose[2])
-            waypoints = period.situation.waypoints @ np.array([[cos, sin], [-sin, cos]]) + pose[:2] + shift
+            waypoints = placed(period.situation.waypoints, pose) + shift
         here = (pose[0] + shift[0], pose[1] + shift[1])
         trail = [*trail[-_TRAIL_PERIODS:], here]
         scene = Scene(
