@@ -431,6 +431,12 @@ def test_it_leads_around_what_blocks_the_way_where_the_command_line_says_so(fold
     assert y > 0.4
 
 
+def test_it_allows_for_a_latency_where_the_command_line_gives_one(folder: Path) -> None:
+    asked = dds_node._parser().parse_args([str(folder), "--latency", "0.2"])
+    with pytest.raises(UserInputError, match=r"latency_s=0\.2 is allowed for by what an agent remembers"):
+        dds_node.bridge_of(asked)
+
+
 def test_zeros_are_open_space_where_the_command_line_says_so(folder: Path) -> None:
     for arguments, reads_zero in (([], True), (["--zero-means", "far"], False)):
         bridge = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), *arguments]))

@@ -197,6 +197,12 @@ def test_it_leads_around_what_blocks_the_way_where_that_is_asked_for(ros_node: A
     assert "the map cannot be read" in node.published[-1].data
 
 
+def test_it_allows_for_a_latency_where_that_is_given(ros_node: Any) -> None:
+    Node.given["latency_s"] = 0.2
+    with pytest.raises(UserInputError, match=r"latency_s=0\.2 is allowed for by what an agent remembers"):
+        ros_node.PolicyNode()
+
+
 def test_cameras_are_read_in_place_of_the_scanner(ros_node: Any) -> None:
     Node.given |= {"camera_frames": ["cam"], "camera_topics": ["front/points"], "camera_views_rad": [1.7]}
     node = ros_node.PolicyNode()

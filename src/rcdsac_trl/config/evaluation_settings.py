@@ -13,6 +13,7 @@ from rcdsac_trl.config.training_settings import SensorSettings, Threads, Trainin
 from rcdsac_trl.config.typed import read, section_class
 from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.latency import check_latency
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.system import runtime
 from rcdsac_trl.system.checks import check_least
@@ -117,6 +118,7 @@ class EvaluationSettings:
     beta_controller: tuple[Literal["clearance", "tail_variance"], ...] | None
     controller: ControllerSettings
     navigation: NavigationSettings
+    latency_s: float
     checkpoint: Name | None
     half_precision: bool
     baseline: str | None
@@ -151,6 +153,8 @@ class EvaluationSettings:
             raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
         if self.baseline is not None and (self.navigation.replan or self.navigation.watchdog):
             raise UserInputError(f"baseline={self.baseline} navigates by itself: leave navigation out")
+        if self.baseline is not None and self.latency_s:
+            raise UserInputError(f"baseline={self.baseline} does not allow for a latency: leave latency_s out")
         if self.baseline is not None and self.half_precision:
             raise UserInputError(f"baseline={self.baseline} has no weights to be rounded: leave half_precision out")
         if self.baseline is not None and self.acting.given:
@@ -205,6 +209,15 @@ class EvaluationSettings:
                 "leave sampled out, or give acting.num_candidates=1"
             )
         return acting
+
+    def latency_of(self, trained: TrainingSettings) -> float:
+        """Return the latency that the agents allow for, s.
+
+        Raises:
+            UserInputError: if they cannot.
+        """
+        check_latency(self.latency_s, trained.sensor.memory_s)
+        return self.latency_s
 
     def world_of(self, trained: TrainingSettings) -> ChosenWorld:
         """Return map set, sensor, task and robot: those of a training, with what was chosen in their place.

@@ -63,7 +63,7 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
     domain_id = _domain_id(os.environ.get("ROS_DOMAIN_ID") or "0")
     remapped = dict(_renaming(text) for text in args.remap)
     driver = Driver(
-        rcdsac_trl.load(args.agent),
+        rcdsac_trl.load(args.agent, latency_s=args.latency),
         mount=_mount(args),
         cameras={frame: _view_rad(frame, view) for frame, _, view in args.camera},
         zero_means=args.zero_means,
@@ -188,6 +188,13 @@ def _parser() -> argparse.ArgumentParser:
         "--detours",
         action="store_true",
         help="lead around what blocks the way for some seconds, and keep clear of what map shows",
+    )
+    parser.add_argument(
+        "--latency",
+        type=float,
+        default=0.0,
+        metavar="SECONDS",
+        help="how late a command acts, which the agent then allows for (default: %(default)s)",
     )
     parser.add_argument("--base-frame", help="the robot's frame; else the odometry's child_frame_id")
     parser.add_argument("--use-sim-time", action="store_true", help="the clock is that of the topic clock")

@@ -72,7 +72,7 @@ class PolicyNode(Node):
         cameras = self._cameras()
         defaults = FrameSettings()
         self.driver = Driver(
-            rcdsac_trl.load(agent),
+            rcdsac_trl.load(agent, latency_s=self._given("latency_s", 0.0)),
             mount=self._mount(),
             cameras={frame: view_rad for frame, _, view_rad in cameras},
             zero_means=self._given("zero_means", "invalid"),

@@ -124,6 +124,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: Chose
         baseline=settings.baseline or PURSUIT,
         one_trip=chosen.barn is not None,
         navigation=settings.navigation,
+        latency_s=0.0 if settings.run is None else settings.latency_of(trained),
         acting=settings.acting_of(trained),
     )
 
@@ -141,6 +142,7 @@ def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: Name
             name = f"{spec.world.robot.name}-{name}"
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
     name += "".join(f"-{part}" for part, is_on in asdict(spec.navigation).items() if is_on)
+    name += f"-latency_{spec.latency_s:g}" if spec.latency_s else ""
     name += "".join(f"-{part}_{value}" for part, value in settings.acting.given.items())
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
     return named.folder_of("evaluation", f"{name}{contexts}")
@@ -166,6 +168,7 @@ def _described(
         "sampled": settings.sampled,
         "acting": None if named is None else asdict(spec.acting),
         "navigation": asdict(settings.navigation),
+        "latency_s": spec.latency_s,
         "conditions": [str(condition) for condition in spec.conditions],
         "map": asdict(spec.world.map_settings),
         "task": asdict(spec.world.task),

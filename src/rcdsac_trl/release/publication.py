@@ -240,7 +240,8 @@ def _acted(described: Mapping[str, Any], acting: ActingSettings) -> bool:
 def _is_helped(described: Mapping[str, Any]) -> bool:
     """Tell whether an evaluation says more, or less, than how an agent drives by itself."""
     navigated = any((described.get("navigation") or {}).values())
-    return navigated or bool(described.get("controller") or described["sampled"])
+    foresighted = bool(described.get("latency_s"))
+    return navigated or foresighted or bool(described.get("controller") or described["sampled"])
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.robot.dead_reckoning import DeadReckoning
 from rcdsac_trl.robot.foreseen_clearance import ForeseenClearance
+from rcdsac_trl.robot.latency import Ahead
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.observation import (
     NUM_FORESEEN_COMMANDS,
@@ -107,6 +108,7 @@ class RememberedRanges:
         omega: float,
         elapsed_s: float,
         measured: NDArray[np.bool_] | None = None,
+        ahead: Ahead | None = None,
     ) -> NDArray[np.float32]:
         """Move on, take in what is seen now, and return what is remembered.
 
@@ -142,6 +144,10 @@ class RememberedRanges:
         of_mover_s = oldest_s + min(self._tracks.settings.coast_s, self._memory_s)
         self._number = _add(points, cells, rows, number, pose, time_s, of_mover_s, seen_m, sensed, moving, far_m)
         self._moving = moving
+        if ahead is not None:
+            pose, (v, omega) = ahead.after(pose), ahead.velocities
+            moving = moving.copy()
+            moving[:, :2] += ahead.latency_s * moving[:, 2:4]
         _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose, self._reach_m)
         _tell_movers(told, moving, pose, self._reach_m)
         told[-2 * NUM_FORESEEN_COMMANDS :] = self._foreseen.nearness(points[: self._number], moving, pose, v, omega)

@@ -25,6 +25,7 @@ from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy
 from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
 from rcdsac_trl.rollout.environments import evaluation_worker
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows
+from rcdsac_trl.rollout.foresight import ForesightedPolicy
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, unpacked_loss
 from rcdsac_trl.rollout.measurement import measure_map
 from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
@@ -64,6 +65,7 @@ class EvaluationSpec:
         baseline: what drives where there is no actor.
         one_trip: drive to the first goal alone; see :func:`~rcdsac_trl.rollout.measurement.measure_map`.
         navigation: what navigates around the agents.
+        latency_s: that the agents allow for, s.
         acting: by tanh(mean) or by the critics' choice.
     """
 
@@ -81,6 +83,7 @@ class EvaluationSpec:
     baseline: str = PURSUIT
     one_trip: bool = False
     navigation: NavigationSettings = field(default_factory=NavigationSettings)
+    latency_s: float = 0.0
     acting: ActingSettings = BY_MEAN
 
 
@@ -127,6 +130,8 @@ def map_evaluator(
             policy = _choosing(spec, policy, loss)
     planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
+    if spec.latency_s:
+        policy = _foresighted(spec, policy, len(agent_ids))
     advised_noise = AgentNoise(agent_ids)
     if spec.navigation.replan or spec.navigation.watchdog:
         policy = _navigated(spec, policy, advised_noise)
@@ -180,9 +185,23 @@ def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, noise: AgentN
     """Put navigators around the agents of a policy."""
     algo, robot = spec.trained.algo, spec.world.robot
     boldest = algo.distortion.measure.high if algo.context_key == "risk" else None
-    period_s = sum(spec.world.task.motor_steps) / len(spec.world.task.motor_steps) * robot.motor_period_s
-    make = partial(_navigator, spec)
-    return NavigatedPolicy(policy, make, robot.sensor_mask(spec.world.sensor), noise, boldest, period_s, robot)
+    make, sensed = partial(_navigator, spec), robot.sensor_mask(spec.world.sensor)
+    return NavigatedPolicy(policy, make, sensed, noise, boldest, _mean_period_s(spec), robot)
+
+
+def _foresighted(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: int) -> ForesightedPolicy:
+    """Let the agents of a policy allow for a latency."""
+    world = spec.world
+    sensed = world.robot.sensor_mask(world.sensor)
+    return ForesightedPolicy(
+        policy, spec.latency_s, sensed, world.memory_s, num_agents, _mean_period_s(spec), world.robot
+    )
+
+
+def _mean_period_s(spec: EvaluationSpec) -> float:
+    """Return how long a step takes that may take several numbers of motor steps, s."""
+    motor_steps = spec.world.task.motor_steps
+    return sum(motor_steps) / len(motor_steps) * spec.world.robot.motor_period_s
 
 
 def _navigator(spec: EvaluationSpec) -> Navigator:

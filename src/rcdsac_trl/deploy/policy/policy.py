@@ -41,14 +41,14 @@ if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.static_layer import Pose
 
 
-def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> Guard | None:
+def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None, latency_s: float) -> Guard | None:
     """Return the guard of a robot's policy.
 
     Raises:
         UserInputError: if the one that was given is another robot's.
     """
     if guard == "robot":
-        return Guard.of(robot)
+        return Guard.of(robot, reaction_s=Guard.reaction_s + latency_s)
     if not isinstance(guard, Guard | None):
         raise UserInputError(f"guard={guard!r} is none: give Guard.of(robot), None to drive without, or leave it out")
     if guard is not None and guard.robot != robot:
@@ -74,17 +74,21 @@ class Policy:
         navigator: hands out other waypoints where the way is blocked, and helps where the robot gets nowhere; None:
             the agent is on its own.
         acting: by the actor's mean or by the critics' choice among some actions; None: as the agent's config says.
+        latency_s: from a measurement until the command that follows it acts, s. :meth:`act` then tells the agent what
+            it will meet by then, and the robot's own guard looks so much farther ahead.
 
     Attributes:
         config: what the agent is.
         robot: that it drives.
+        latency_s: that it allows for, s.
         measured: what is known of how it drives; None where nothing is.
         fractions: of the quantiles, the midpoints of equal parts of [0, 1], float32 [N].
         default_beta: what ``beta`` is where none is given, the middle of the trained range (-1 for the power law);
             None for an agent that is told none.
 
     Raises:
-        UserInputError: if the guard is another robot's, or the critics are to choose by a measure of your own.
+        UserInputError: if the guard is another robot's, the critics are to choose by a measure of your own, or the
+            latency cannot be allowed for.
     """
 
     def __init__(
@@ -96,16 +100,18 @@ class Policy:
         num_quantiles: int = 16,
         navigator: "Navigator | None" = None,
         acting: ActingSettings | None = None,
+        latency_s: float = 0.0,
     ) -> None:
         self.config = weights.config
         self.measured = weights.measured
         self.robot = self.config.robot
-        self.guard = _guard_of(self.robot, guard)
+        self._observer = RobotObserver(self.config, latency_s)
+        self.guard = _guard_of(self.robot, guard, latency_s)
         self.limits = limits
+        self.latency_s = latency_s
         self.navigator = navigator
         self.fractions = fractions_of(num_quantiles)
         self.default_beta = middle_of_range(self.config) if self.config.context == "beta" else None
-        self._observer = RobotObserver(self.config)
         self._networks = RecurrentNetworks(weights, self.fractions, self.config.acting if acting is None else acting)
         self._periods = ControlPeriods(self.config.period_s)
         self._halted = False
@@ -182,8 +188,8 @@ class Policy:
             float32 [2], each in [-1, 1]; [N, 2] of N agents.
 
         Raises:
-            UserInputError: if the observation is of another sensor or memory than the agent's, or :meth:`act` would
-                refuse `beta` or `collision_weight`.
+            UserInputError: if the observation is of another sensor or memory than the agent's, :meth:`act` would refuse
+                `beta` or `collision_weight`, or the policy allows for a latency, which observations do not tell it of.
 
         Example:
             >>> import gymnasium, rcdsac_trl
@@ -193,6 +199,11 @@ class Policy:
             >>> policy.act_on(observation, beta=-1.0).shape
             (2,)
         """
+        if self.latency_s:
+            raise UserInputError(
+                f"latency_s={self.latency_s:g} is allowed for by act(), and act_on() takes observations as they are: "
+                "load the agent without it, or give task.action_delay_steps and latency_s to evaluate"
+            )
         seen = observed(observation, self.config)
         try:
             context = self._context(beta, collision_weight)

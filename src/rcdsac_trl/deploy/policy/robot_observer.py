@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
+from rcdsac_trl.robot.latency import Latency, check_latency
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.sectors import Sectors
 
@@ -29,14 +30,18 @@ class RobotObserver:
 
     Args:
         config: of the agent.
+        latency_s: from a measurement until the command that follows it acts, s: waypoints, velocities and what is
+            remembered are then told as they will be; the range bins stay as they are.
 
     Attributes:
         mask: which range bins the agent is told, bool [180].
         commanded: what the robot was told last, m/s and rad/s.
     """
 
-    def __init__(self, config: AgentConfig) -> None:
+    def __init__(self, config: AgentConfig, latency_s: float = 0.0) -> None:
+        check_latency(latency_s, config.memory_s)
         self.mask, self._robot = config.sensor_mask, config.robot
+        self._latency = Latency(latency_s, config.robot) if latency_s else None
         self._remembered = _memory_of(config)
         self.forget()
 
@@ -44,6 +49,8 @@ class RobotObserver:
         """Forget what was seen before; the robot stands."""
         if self._remembered is not None:
             self._remembered.reset()
+        if self._latency is not None:
+            self._latency.reset()
         self.commanded = (0.0, 0.0)
 
     def observe(
@@ -62,7 +69,13 @@ class RobotObserver:
             elapsed_s: since the last observation, 0 at the first, s.
         """
         bins = range_observation(sectors.distances_m, self.mask, self._robot.lidar.max_range_m)
-        vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *measured, *self.commanded]
+        told, ahead = measured, None
+        if self._latency is not None:
+            ahead = self._latency.ahead(measured, self.commanded, elapsed_s)
+            first, second = ahead.seen(np.array(waypoints)).tolist()
+            waypoints, told = (tuple(first), tuple(second)), ahead.velocities
+        vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *told, *self.commanded]
         if self._remembered is not None:
-            vectors += self._remembered.observe(sectors.distances_m, *measured, elapsed_s, sectors.covered).tolist()
+            distances_m, covered = sectors.distances_m, sectors.covered
+            vectors += self._remembered.observe(distances_m, *measured, elapsed_s, covered, ahead).tolist()
         return bins, vectors
