@@ -5,7 +5,7 @@ from pathlib import Path
 import pandas as pd
 
 from rcdsac_trl.colors import LIGHT
-from rcdsac_trl.report.figures import learning_curves
+from rcdsac_trl.report.learning_figures import learning_curves
 
 RESULTS = Path(__file__).parents[2] / "results" / "rules-1"
 # Iterations that make one point: 150 episodes a seed.

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from rcdsac_trl.report.figures import beta_response, paired_differences
+from rcdsac_trl.report.comparison_figures import paired_differences
 from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.response_figures import beta_response
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parents[1] / "results"

@@ -15,10 +15,12 @@ from omegaconf import OmegaConf
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import __main__ as command
 from rcdsac_trl.report import collision_report, findings, statistics, table
+from rcdsac_trl.report.comparison_figures import collision_causes, paired_differences
 from rcdsac_trl.report.evaluation_summary import summarised
-from rcdsac_trl.report.figures import beta_response, collision_causes, learning_curves, paired_differences
 from rcdsac_trl.report.learning import validation_of_runs
+from rcdsac_trl.report.learning_figures import learning_curves
 from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.response_figures import beta_response
 from rcdsac_trl.report.results import Results
 from rcdsac_trl.report.write import write_report
 from rcdsac_trl.world.maps.shapes import Kind

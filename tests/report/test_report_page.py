@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from rcdsac_trl.colors import DARK, SERIES, shades
-from rcdsac_trl.report.figures import THING_COLORS
+from rcdsac_trl.report.comparison_figures import THING_COLORS
 from rcdsac_trl.report.night import at_night
 from rcdsac_trl.report.page import Card, Figures, Folded, Heading, Picture, Section, page, svg
 from rcdsac_trl.report.style import FAINT, GRID, INK, PAPER, VERDICTS, series, style

@@ -33,6 +33,11 @@ def labels(episodes: Episodes) -> list[str]:
     return [condition_label(agent, name, beta, weight, by, sensors) for agent, name, beta, weight, by in rows]
 
 
+def several_seeds(episodes: Episodes, conditions: pd.DataFrame) -> bool:
+    """Return whether any of these conditions was driven by agents of several training seeds."""
+    return any(len(episodes.of(condition, "reward")) > 1 for _, condition in conditions.iterrows())
+
+
 def bounded(values: Array, metric: str, statistic: Statistic = statistics.mean) -> Interval:
     """Return a statistic of a metric and its interval, none of it outside of what the metric can be."""
     return statistics.bootstrap(values, statistic).within(*possible(metric))

@@ -5,11 +5,13 @@ from collections.abc import Callable, Sequence
 import pandas as pd
 
 from rcdsac_trl.report import collision_report, findings, table
+from rcdsac_trl.report.comparison_figures import collision_causes, paired_differences
 from rcdsac_trl.report.course_claims import COURSE
 from rcdsac_trl.report.course_table import DIRECTIONS
-from rcdsac_trl.report.figures import beta_panels, collision_causes, learning_panels, paired_differences
 from rcdsac_trl.report.formats import heading, interval, number, p_value
+from rcdsac_trl.report.learning_figures import learning_panels
 from rcdsac_trl.report.page import Card, Figures, Folded, Heading, Part, Section
+from rcdsac_trl.report.response_figures import beta_panels
 from rcdsac_trl.report.results import Results
 from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, PERMUTATIONS
 from rcdsac_trl.report.verdict_words import evidence, missing, numbers, of_agents, over, tally

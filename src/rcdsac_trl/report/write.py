@@ -5,9 +5,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from rcdsac_trl.report import findings, table
-from rcdsac_trl.report.figures import beta_response, collision_causes, learning_curves, paired_differences
+from rcdsac_trl.report.comparison_figures import collision_causes, paired_differences
 from rcdsac_trl.report.folder import CLAIMS, check_report_folder, clear_report_folder
+from rcdsac_trl.report.learning_figures import learning_curves
 from rcdsac_trl.report.page import page
+from rcdsac_trl.report.response_figures import beta_response
 from rcdsac_trl.report.results import Results
 from rcdsac_trl.report.sections import lead, sections, title
 from rcdsac_trl.report.verdict_words import as_table, evidence

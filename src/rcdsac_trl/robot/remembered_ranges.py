@@ -21,6 +21,7 @@ from rcdsac_trl.robot.observation import (
     REMEMBERED_MOVER_SIZE,
     REMEMBERED_SIZE,
 )
+from rcdsac_trl.robot.planar import placed, seen_from
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
@@ -90,16 +91,9 @@ class RememberedRanges:
         Returns:
             Points float64 [n, 2] in m, and what moves, float64 [k, 3]: x, y and radius in m.
         """
-        own = self._reckoning.pose
-        turn = pose[2] - own[2]
-        cos, sin = math.cos(turn), math.sin(turn)
-
-        def placed(points: NDArray[np.float64]) -> NDArray[np.float64]:
-            placed_points: NDArray[np.float64] = (points - own[:2]) @ np.array([[cos, sin], [-sin, cos]]) + pose[:2]
-            return placed_points
-
-        moving = self._moving
-        return placed(self._points[: self._number, :2]), np.column_stack([placed(moving[:, :2]), moving[:, 4]])
+        own, moving = self._reckoning.pose, self._moving
+        points, centres = (placed(seen_from(each[:, :2], own), pose) for each in (self._points[: self._number], moving))
+        return points, np.column_stack([centres, moving[:, 4]])
 
     def observe(
         self,
