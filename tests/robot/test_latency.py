@@ -21,26 +21,45 @@ FULL = sensor_mask("full")
 
 def test_at_a_held_command_it_is_an_arc() -> None:
     latency, held = Latency(0.5), (0.5, 1.0)
-    for step in range(6):
-        ahead = latency.ahead(held, held, PERIOD_S if step else 0.0)
+    latency.note(held, 0.0)
+    ahead = latency.ahead(held, 0.5)
     # Of radius v / omega, to the error of a motor step's chord.
     assert ahead.pose == pytest.approx((0.5 * math.sin(0.5), 0.5 * (1.0 - math.cos(0.5)), 0.5), abs=0.005)
     assert ahead.velocities == pytest.approx(held)
 
 
 def test_a_command_acts_only_after_the_latency_and_those_before_it_until_then() -> None:
-    latency = Latency(2.0 * PERIOD_S)
-    latency.ahead((0.0, 0.0), (0.0, 0.0), 0.0)
-    # Told 0.6 m/s a period ago: it stands for another period, and then speeds up at 1.5 m/s^2 for one.
-    ahead = latency.ahead((0.0, 0.0), (0.6, 0.0), PERIOD_S)
-    assert ahead.velocities[0] == pytest.approx(1.5 * PERIOD_S)
-    assert ahead.pose[0] == pytest.approx(0.5 * 1.5 * PERIOD_S**2, abs=0.003)
+    latency = Latency(0.3)
+    latency.note((0.0, 0.0), 1.0)
+    latency.note((0.6, 0.0), 1.2)
+    # At 1.35 s it stands for 0.15 s more, and then speeds up at 1.5 m/s^2 for as long.
+    ahead = latency.ahead((0.0, 0.0), 1.35)
+    assert ahead.velocities[0] == pytest.approx(1.5 * 0.15, abs=0.03)
+    assert ahead.pose[0] == pytest.approx(0.5 * 1.5 * 0.15**2, abs=0.004)
+    # At 1.65 s it has been on for 0.15 s.
+    assert latency.ahead((0.225, 0.0), 1.65).velocities[0] == pytest.approx(0.6)
+
+
+def test_a_robot_whose_commands_are_not_known_goes_on_as_it_moves() -> None:
+    latency = Latency(0.4)
+    latency.note((0.0, 0.0), 0.0)
     latency.reset()
-    assert latency.ahead((0.0, 0.0), (0.0, 0.0), 0.0).pose == (0.0, 0.0, 0.0)
+    assert latency.ahead((0.5, 0.0), 1.0).pose == pytest.approx((0.2, 0.0, 0.0))
+    # A command that follows acts only after the latency.
+    latency.note((0.0, 0.0), 1.0)
+    assert latency.ahead((0.5, 0.0), 1.2).pose[0] == pytest.approx(0.1 + 0.5 * 0.2 - 0.5 * 1.5 * 0.2**2, abs=0.004)
+
+
+def test_the_newest_command_of_a_time_counts_and_a_clock_may_be_set_back() -> None:
+    latency = Latency(0.2)
+    for at_s in (900.0, 5.0):
+        latency.note((0.6, 0.0), at_s)
+    latency.note((0.0, 0.0), 5.0)
+    assert latency.ahead((0.0, 0.0), 5.2) == ((0.0, 0.0, 0.0), (0.0, 0.0), 0.2)
 
 
 def test_without_a_latency_the_robot_is_where_it_is() -> None:
-    assert Latency(0.0).ahead((0.3, 0.2), (0.6, 1.0), PERIOD_S) == ((0.0, 0.0, 0.0), (0.3, 0.2), 0.0)
+    assert Latency(0.0).ahead((0.3, 0.2), 0.0) == ((0.0, 0.0, 0.0), (0.3, 0.2), 0.0)
 
 
 def test_the_simulated_robot_gets_there() -> None:
@@ -53,7 +72,9 @@ def test_the_simulated_robot_gets_there() -> None:
     for step in range(60):
         v, omega, *commanded = group.buffers.velocity[0].tolist()
         poses.append(group.buffers.pose[0].copy())
-        expected.append(latency.ahead((v, omega), (commanded[0], commanded[1]), PERIOD_S if step else 0.0))
+        if step:
+            latency.note((commanded[0], commanded[1]), PERIOD_S * (step - 1))
+        expected.append(latency.ahead((v, omega), PERIOD_S * step))
         free.append(not group.buffers.contact[0, 0])
         group.step(rng.uniform(-1.0, 1.0, (1, 2)))
     group.close()
@@ -83,27 +104,42 @@ def test_what_is_remembered_is_told_as_from_there() -> None:
     assert np.abs(told[46:] - now.observe(seen, 0.0, 0.0, 0.0)[46:]).max() > 0.3
 
 
-def test_what_walks_is_told_where_it_will_be() -> None:
-    def after_walking(ahead: Ahead | None) -> np.ndarray:
+@pytest.mark.parametrize(
+    ("velocity", "moved"),
+    [((-0.5, 0.0), (1.0, 0.0)), ((0.5, 0.0), (1.4, 0.0)), ((0.0, 0.5), (1.2, 0.2))],
+    ids=["comes", "leaves", "crosses"],
+)
+def test_who_walks_is_told_where_they_will_be_and_not_where_they_are(
+    velocity: tuple[float, float], moved: tuple[float, float]
+) -> None:
+    """Seen for two seconds, at (1.2, 0) now; in 0.4 s 0.2 m farther on."""
+
+    def told_of(at: tuple[float, float], ahead: Ahead | None) -> np.ndarray:
         remembered = RememberedRanges(FULL, 12.0)
         for step in range(15):
-            at_m = 2.5 - 0.5 * PERIOD_S * step  # towards the robot at 0.5 m/s
-            ranges = sector_distances(0.0, 0.0, 0.0, np.empty((0, 4)), np.array([[at_m, 0.0, 0.25]]))
+            since_s = PERIOD_S * (step - 14)
+            disc = np.array([[at[0] + velocity[0] * since_s, at[1] + velocity[1] * since_s, 0.25]])
+            ranges = sector_distances(0.0, 0.0, 0.0, np.empty((0, 4)), disc)
             told = remembered.observe(ranges, 0.0, 0.0, PERIOD_S if step else 0.0, ahead=ahead)
         return told
 
-    now, then = (after_walking(each) for each in (None, Ahead((0.0, 0.0, 0.0), (0.0, 0.0), 0.4)))
-
-    def gap_m(told: np.ndarray) -> float:
-        return 2.8 / 10.0 ** float(told[NUM_REMEMBERED_SECTORS]) + 0.2
-
-    assert gap_m(now) - gap_m(then) == pytest.approx(0.5 * 0.4, abs=0.05)
+    standing = Ahead((0.0, 0.0, 0.0), (0.0, 0.0), 0.4)
+    ahead, there, here = told_of((1.2, 0.0), standing), told_of(moved, None), told_of((1.2, 0.0), None)
+    # As if they had walked on already: to a few centimetres of what a sector sees and a track lags behind.
+    np.testing.assert_allclose(ahead, there, atol=0.12)
+    assert np.abs(ahead - here).max() > 0.15
 
 
 @pytest.mark.parametrize(
     ("latency_s", "memory_s", "why"),
-    [(-0.1, 12.0, "from 0 to 1"), (1.5, 12.0, "from 0 to 1"), (math.nan, 12.0, "from 0 to 1"), (0.2, 0.0, "remembers")],
+    [(strange, 12.0, r"a number from 0 to 0\.5") for strange in (-0.1, 0.6, math.nan, "0.2", None, True, [0.2])]
+    + [(0.2, 0.0, "remembers nothing")],
 )
-def test_what_nobody_can_allow_for_is_refused(latency_s: float, memory_s: float, why: str) -> None:
+def test_what_nobody_can_allow_for_is_refused(latency_s: object, memory_s: float, why: str) -> None:
     with pytest.raises(UserInputError, match=why):
         check_latency(latency_s, memory_s)
+
+
+@pytest.mark.parametrize("latency_s", [0, 0.5, np.float32(0.25)])
+def test_any_number_is_one(latency_s: float) -> None:
+    check_latency(latency_s, 12.0)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from rcdsac_trl.deploy import Guard, Policy
+from rcdsac_trl.deploy import Guard, Policy, Stamps
 from rcdsac_trl.deploy.policy.robot_observer import RobotObserver
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
@@ -43,7 +43,8 @@ class Told(TensorDictModuleBase):
 
 def test_an_agent_is_told_in_a_simulation_what_it_is_told_on_a_robot() -> None:
     inner = Told()
-    policy = ForesightedPolicy(inner, LATENCY_S, NARROW, MEMORY_S, 1, PERIOD_S)
+    policy = ForesightedPolicy(inner, LATENCY_S, NARROW, MEMORY_S, 1)
+    policy.set_periods([PERIOD_S])
     observer = RobotObserver(agent(memory_s=MEMORY_S, range_code="nearness").config, LATENCY_S)
     rng = np.random.default_rng(0)
     for step in range(12):
@@ -61,12 +62,14 @@ def test_an_agent_is_told_in_a_simulation_what_it_is_told_on_a_robot() -> None:
         after = policy(tensordict.clone())
         assert all(torch.equal(after[key], tensordict[key]) for key in given)  # observations stay as they were
         sectors = Sectors(np.where(NARROW, seen, np.inf), NARROW)
-        bins, vectors = observer.observe(sectors, tuple(AHEAD), tuple(velocity[:2].tolist()), PERIOD_S if step else 0.0)
+        v, omega = velocity[:2].tolist()
+        elapsed_s = PERIOD_S if step else 0.0
+        bins, vectors = observer.observe(sectors, tuple(AHEAD), (v, omega), elapsed_s, PERIOD_S * step)
         told = inner.told[-1]
         np.testing.assert_array_equal(told["range"], bins)
         np.testing.assert_allclose(np.concatenate([told[key] for key in KEYS]), vectors, atol=2e-4)
         assert bool(torch.equal(told["waypoint"], tensordict["waypoint"][0])) == (step == 0)
-        observer.commanded = (float(rng.uniform(-0.2, 0.6)), float(rng.uniform(-1.5, 1.5)))
+        observer.note((float(rng.uniform(-0.2, 0.6)), float(rng.uniform(-1.5, 1.5))), PERIOD_S * step)
 
 
 def test_a_policy_allows_for_it_and_so_does_its_own_guard() -> None:
@@ -78,6 +81,8 @@ def test_a_policy_allows_for_it_and_so_does_its_own_guard() -> None:
     assert wanted[0] != wanted[1]
     late.reset()
     assert [late.act(OPEN, AHEAD, [0.3, 0.2], -1.0).wanted for _ in range(3)] == wanted[0]
+    with pytest.raises(AttributeError):
+        late.latency_s = 0.1  # type: ignore[misc]
     own = Guard(margin_m=0.1)
     assert Policy(weights, latency_s=LATENCY_S, guard=own).guard == own
 
@@ -102,3 +107,23 @@ def test_an_evaluation_says_what_was_allowed_for(tmp_path: Path) -> None:
 def test_an_evaluation_refuses_what_cannot_be() -> None:
     with pytest.raises(UserInputError, match="baseline=dwa does not allow for a latency"):
         evaluate("baseline=dwa", "latency_s=0.1")
+    with pytest.raises(UserInputError, match=r"tail_variance.* leave one out"):
+        evaluate("run=anybody", "latency_s=0.1", "beta_controller=[tail_variance]")
+    with pytest.raises(UserInputError, match=r"record=true .* leave one out"):
+        evaluate("run=anybody", "latency_s=0.1", "record=true")
+
+
+def test_commands_are_dated_by_the_odometry_that_they_follow() -> None:
+    """Repeated and refused calls, too: what is under way is what was told, when it was told."""
+    policy = Policy(agent(memory_s=MEMORY_S, range_code="nearness"), latency_s=LATENCY_S)
+    told = []
+    for at_s, waypoints in ((1.0, AHEAD), (1.06, AHEAD), (1.2, None), (1.34, AHEAD)):
+        command = policy.act(OPEN, waypoints, STANDING, -1.0, stamps=Stamps(at_s, at_s, at_s, at_s))
+        told.append((command.v_m_per_s, command.omega_rad_per_s))
+    assert told[2] == (0.0, 0.0)
+    latency = policy._observer._latency
+    assert latency is not None
+    due_s = [due for due, _, _ in latency._commands]
+    # The refused one has no time of its own: a period later than the one before.
+    assert due_s == pytest.approx([1.06 + LATENCY_S, 1.06 + 0.14 + LATENCY_S, 1.34 + LATENCY_S])
+    assert [(v, omega) for _, v, omega in latency._commands] == told[1:]

@@ -155,6 +155,12 @@ class EvaluationSettings:
             raise UserInputError(f"baseline={self.baseline} navigates by itself: leave navigation out")
         if self.baseline is not None and self.latency_s:
             raise UserInputError(f"baseline={self.baseline} does not allow for a latency: leave latency_s out")
+        if self.latency_s and (self.record or "tail_variance" in (self.beta_controller or ())):
+            what = "record=true shows" if self.record else "beta_controller=[tail_variance] reads"
+            raise UserInputError(
+                f"{what} what critics expect of what is seen now, and with latency_s agents are told what will be: "
+                "leave one out"
+            )
         if self.baseline is not None and self.half_precision:
             raise UserInputError(f"baseline={self.baseline} has no weights to be rounded: leave half_precision out")
         if self.baseline is not None and self.acting.given:

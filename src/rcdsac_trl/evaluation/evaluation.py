@@ -168,12 +168,13 @@ def _described(
         "sampled": settings.sampled,
         "acting": None if named is None else asdict(spec.acting),
         "navigation": asdict(settings.navigation),
-        "latency_s": spec.latency_s,
         "conditions": [str(condition) for condition in spec.conditions],
         "map": asdict(spec.world.map_settings),
         "task": asdict(spec.world.task),
         "commit": commit(),
     }
+    if spec.latency_s:
+        described["latency_s"] = spec.latency_s
     if spec.controller is not None:
         described["controller"] = asdict(spec.controller)
     return described if settings.baseline is None else described | settings_of(settings.baseline)

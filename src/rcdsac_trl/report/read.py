@@ -239,8 +239,11 @@ def _acting_of(evaluation: Evaluation) -> str:
     """Say how an agent acted; evaluations of earlier versions say nothing, all by tanh(mean)."""
     acting = evaluation.described.get("acting")
     if acting is None or acting["num_candidates"] == 1:
-        return "acting.num_candidates=1"
-    return " ".join(f"acting.{name}={value}" for name, value in acting.items())
+        acting = {"num_candidates": 1}
+    said = [f"acting.{name}={value}" for name, value in acting.items()]
+    if latency_s := evaluation.described.get("latency_s"):
+        said.append(f"latency_s={latency_s:g}")
+    return " ".join(said)
 
 
 def _same_robot(one: dict[str, Any] | None, other: dict[str, Any] | None) -> bool:

@@ -16,15 +16,16 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.planar import placed, seen_from
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.sectors import is_finite_number
 
-MOST_LATENCY_S = 1.0
-"""Farther ahead nobody knows what people do."""
+MOST_LATENCY_S = 0.5
+"""Farther ahead neither people nor the way into a stop zone can be told."""
 
 # Times nearer to each other than this are one: they are sums of floats.
 _SAME_S = 1e-6
 
 
-def check_latency(latency_s: float, memory_s: float) -> None:
+def check_latency(latency_s: object, memory_s: float) -> None:
     """Refuse a latency that nobody can allow for.
 
     Args:
@@ -32,14 +33,14 @@ def check_latency(latency_s: float, memory_s: float) -> None:
         memory_s: for how long the agent remembers points, s.
 
     Raises:
-        UserInputError: if it is negative, or longer than :data:`MOST_LATENCY_S`, or the agent remembers nothing: only
-            what is remembered can be told as it will be.
+        UserInputError: if it is no number, negative, or longer than :data:`MOST_LATENCY_S`, or the agent remembers
+            nothing: only what is remembered can be told as it will be.
     """
-    if not 0.0 <= latency_s <= MOST_LATENCY_S:
-        raise UserInputError(f"latency_s={latency_s} must be from 0 to {MOST_LATENCY_S:g} seconds")
+    if not is_finite_number(latency_s) or not 0.0 <= float(latency_s) <= MOST_LATENCY_S:  # type: ignore[arg-type]
+        raise UserInputError(f"latency_s={latency_s!r} must be a number from 0 to {MOST_LATENCY_S:g} seconds")
     if latency_s and not memory_s:
         raise UserInputError(
-            f"latency_s={latency_s:g} is allowed for by what an agent remembers, and this one remembers nothing "
+            f"latency_s={latency_s} is allowed for by what an agent remembers, and this one remembers nothing "
             "(sensor.memory_s=0): leave it out, or take an agent that does"
         )
 
@@ -75,8 +76,9 @@ class Latency:
         robot: whose limits of acceleration count.
 
     Example:
-        >>> latency = Latency(0.2)  # at 0.5 m/s, told to stand: by then it brakes at 1.5 m/s^2
-        >>> ahead = latency.ahead(measured=(0.5, 0.0), commanded=(0.0, 0.0), elapsed_s=0.0)
+        >>> latency = Latency(0.2)
+        >>> latency.note((0.0, 0.0), at_s=1.0)
+        >>> ahead = latency.ahead((0.5, 0.0), at_s=1.2)  # it brakes at 1.5 m/s^2
         >>> [round(each, 3) for each in (*ahead.pose, *ahead.velocities)]
         [0.067, 0.0, 0.0, 0.2, 0.0]
     """
@@ -90,35 +92,43 @@ class Latency:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the commands; the robot stands."""
-        # When each begins to act, s from now, and its velocities; the first acts already.
-        self._commands: deque[tuple[float, float, float]] = deque([(-math.inf, 0.0, 0.0)])
+        """Forget the commands: whatever they were, the robot goes on as it moves until the next one acts."""
+        # When each begins to act, s, and its velocities; the first acts already.
+        self._commands: deque[tuple[float, float, float]] = deque()
 
-    def ahead(self, measured: tuple[float, float], commanded: tuple[float, float], elapsed_s: float) -> Ahead:
-        """Take in the last command, and return where the robot will be when the next one begins to act.
+    def note(self, command: tuple[float, float], at_s: float) -> None:
+        """Take down a command.
 
         Args:
-            measured: velocities now, m/s and rad/s.
-            commanded: what the robot was told at the measurement before, m/s and rad/s.
-            elapsed_s: since then, s.
+            command: m/s and rad/s.
+            at_s: time of the measurement that it follows, s. Commands of that time or later are forgotten: it stands
+                for them, or the clock was set back.
         """
-        self._take(commanded, elapsed_s)
-        commands = list(self._commands)
+        due_s = at_s + self._latency_s
+        while self._commands and self._commands[-1][0] >= due_s - _SAME_S:
+            self._commands.pop()
+        self._commands.append((due_s, *command))
+
+    def ahead(self, measured: tuple[float, float], at_s: float) -> Ahead:
+        """Return where the robot will be when the command that follows a measurement begins to act.
+
+        Args:
+            measured: velocities, m/s and rad/s.
+            at_s: time of the measurement, s.
+        """
+        if not self._commands or self._commands[0][0] > at_s + _SAME_S:
+            self._commands.appendleft((-math.inf, *measured))
+        while len(self._commands) > 1 and self._commands[1][0] <= at_s + _SAME_S:
+            self._commands.popleft()
+        under_way = list(self._commands)
         x = y = yaw = 0.0
         v, omega = measured
         for step in range(self._steps):
-            while len(commands) > 1 and commands[1][0] <= step * self._period_s + _SAME_S:
-                commands.pop(0)
-            _, wanted_v, wanted_omega = commands[0]
+            while len(under_way) > 1 and under_way[1][0] <= at_s + step * self._period_s + _SAME_S:
+                under_way.pop(0)
+            _, wanted_v, wanted_omega = under_way[0]
             v, omega = clip_command(wanted_v, wanted_omega, v, omega, self._period_s, self._robot)
             yaw += omega * self._period_s
             x += v * self._period_s * math.cos(yaw)
             y += v * self._period_s * math.sin(yaw)
         return Ahead((x, y, yaw), (v, omega), self._latency_s)
-
-    def _take(self, commanded: tuple[float, float], elapsed_s: float) -> None:
-        """Let time pass, note a command, and drop those that no longer act."""
-        self._commands = deque((due_s - elapsed_s, v, omega) for due_s, v, omega in self._commands)
-        self._commands.append((self._latency_s - elapsed_s, *commanded))
-        while len(self._commands) > 1 and self._commands[1][0] <= _SAME_S:
-            self._commands.popleft()

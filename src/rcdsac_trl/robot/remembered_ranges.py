@@ -138,14 +138,27 @@ class RememberedRanges:
         of_mover_s = oldest_s + min(self._tracks.settings.coast_s, self._memory_s)
         self._number = _add(points, cells, rows, number, pose, time_s, of_mover_s, seen_m, sensed, moving, far_m)
         self._moving = moving
+        known = points[: self._number]
         if ahead is not None:
+            known, moving = _moved_on(known, moving, ahead.latency_s)
             pose, (v, omega) = ahead.after(pose), ahead.velocities
-            moving = moving.copy()
-            moving[:, :2] += ahead.latency_s * moving[:, 2:4]
-        _tell_points(told[:NUM_REMEMBERED_SECTORS], points[: self._number], pose, self._reach_m)
+        _tell_points(told[:NUM_REMEMBERED_SECTORS], known, pose, self._reach_m)
         _tell_movers(told, moving, pose, self._reach_m)
-        told[-2 * NUM_FORESEEN_COMMANDS :] = self._foreseen.nearness(points[: self._number], moving, pose, v, omega)
+        told[-2 * NUM_FORESEEN_COMMANDS :] = self._foreseen.nearness(known, moving, pose, v, omega)
         return told
+
+
+def _moved_on(
+    points: NDArray[np.float64], moving: NDArray[np.float64], by_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what moves where it will be, and the points with those of what is seen moving there, too."""
+    points, later = points.copy(), moving.copy()
+    later[:, :2] += by_s * moving[:, 2:4]
+    for x, y, vx, vy, radius_m, unseen_s in moving:
+        if unseen_s == 0.0:
+            own = np.hypot(points[:, 0] - x, points[:, 1] - y) < radius_m + _MOVER_MARGIN_M
+            points[own, :2] += by_s * np.array([vx, vy])
+    return points, later
 
 
 # ------------------------------------------------------------------------------------------------ compiled

@@ -1,5 +1,7 @@
 """Agents whose commands act late, told in a simulation what they will meet by then: the same as on a robot."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,8 +19,7 @@ _AT_ORIGIN = (0.0, 0.0, 0.0)
 class ForesightedPolicy(TensorDictModuleBase):
     """A policy whose agents are told waypoints, velocities and what is remembered as they will be.
 
-    Range bins stay as they are. Agents are not told how long a step takes: it counts as the middle of the task's
-    periods.
+    Range bins stay as they are.
 
     Args:
         policy: acts on `waypoint`, `velocity` and `remembered`.
@@ -26,7 +27,6 @@ class ForesightedPolicy(TensorDictModuleBase):
         sensed: which of the 180 sectors the sensor has, bool [180].
         memory_s: for how long an agent remembers points, s.
         num_agents: that drive side by side.
-        period_s: of a step, s.
         robot: that is driven.
     """
 
@@ -37,7 +37,6 @@ class ForesightedPolicy(TensorDictModuleBase):
         sensed: NDArray[np.bool_],
         memory_s: float,
         num_agents: int,
-        period_s: float,
         robot: RobotSettings = PAPER,
     ) -> None:
         super().__init__()
@@ -45,8 +44,13 @@ class ForesightedPolicy(TensorDictModuleBase):
         self.policy = policy
         self._latencies = [Latency(latency_s, robot) for _ in range(num_agents)]
         self._memories = [RememberedRanges(sensed, memory_s, robot) for _ in range(num_agents)]
-        self._period_s = period_s
+        self._periods_s = [0.0] * num_agents
+        self._times_s = [0.0] * num_agents
         self._max_range_m = robot.lidar.max_range_m
+
+    def set_periods(self, periods_s: Sequence[float]) -> None:
+        """Say how long a step of each agent's next episode takes, s."""
+        self._periods_s = list(periods_s)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, acting on what its agents will meet; observations stay as they were."""
@@ -63,12 +67,16 @@ class ForesightedPolicy(TensorDictModuleBase):
         begins = tensordict["is_init"][:, 0].tolist()
         waypoints, moving, remembered = [], [], []
         for row, (latency, memory) in enumerate(zip(self._latencies, self._memories, strict=True)):
+            v, omega, *commanded = velocities[row]
+            elapsed_s = 0.0 if begins[row] else self._periods_s[row]
             if begins[row]:
                 latency.reset()
                 memory.reset()
-            elapsed_s = 0.0 if begins[row] else self._period_s
-            v, omega, *commanded = velocities[row]
-            ahead = latency.ahead((v, omega), (commanded[0], commanded[1]), elapsed_s)
+                self._times_s[row] = 0.0
+            else:
+                latency.note((commanded[0], commanded[1]), self._times_s[row])
+                self._times_s[row] += elapsed_s
+            ahead = latency.ahead((v, omega), self._times_s[row])
             first, second = ahead.seen(places[row]).tolist()
             waypoints.append(waypoint_observation(_AT_ORIGIN, first, second))
             moving.append([*ahead.velocities, *commanded])

@@ -130,8 +130,8 @@ def map_evaluator(
             policy = _choosing(spec, policy, loss)
     planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
-    if spec.latency_s:
-        policy = _foresighted(spec, policy, len(agent_ids))
+    foresighted = _foresighted(spec, policy, len(agent_ids)) if spec.latency_s else None
+    policy = foresighted or policy
     advised_noise = AgentNoise(agent_ids)
     if spec.navigation.replan or spec.navigation.watchdog:
         policy = _navigated(spec, policy, advised_noise)
@@ -147,6 +147,8 @@ def map_evaluator(
         advised_noise.begin(spec.seed, "navigated actions", map_index)
         if planner is not None:
             planner.set_map(map_index)
+        if foresighted is not None:
+            foresighted.set_periods(_periods_s(spec, map_index).tolist())
         return measure_map(
             worker,
             policy,
@@ -185,23 +187,16 @@ def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, noise: AgentN
     """Put navigators around the agents of a policy."""
     algo, robot = spec.trained.algo, spec.world.robot
     boldest = algo.distortion.measure.high if algo.context_key == "risk" else None
-    make, sensed = partial(_navigator, spec), robot.sensor_mask(spec.world.sensor)
-    return NavigatedPolicy(policy, make, sensed, noise, boldest, _mean_period_s(spec), robot)
+    period_s = sum(spec.world.task.motor_steps) / len(spec.world.task.motor_steps) * robot.motor_period_s
+    make = partial(_navigator, spec)
+    return NavigatedPolicy(policy, make, robot.sensor_mask(spec.world.sensor), noise, boldest, period_s, robot)
 
 
 def _foresighted(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: int) -> ForesightedPolicy:
     """Let the agents of a policy allow for a latency."""
     world = spec.world
     sensed = world.robot.sensor_mask(world.sensor)
-    return ForesightedPolicy(
-        policy, spec.latency_s, sensed, world.memory_s, num_agents, _mean_period_s(spec), world.robot
-    )
-
-
-def _mean_period_s(spec: EvaluationSpec) -> float:
-    """Return how long a step takes that may take several numbers of motor steps, s."""
-    motor_steps = spec.world.task.motor_steps
-    return sum(motor_steps) / len(motor_steps) * spec.world.robot.motor_period_s
+    return ForesightedPolicy(policy, spec.latency_s, sensed, world.memory_s, num_agents, world.robot)
 
 
 def _navigator(spec: EvaluationSpec) -> Navigator:

@@ -15,6 +15,7 @@ class ControlPeriods:
 
     Attributes:
         last: stamps of the last good input; None where it had none.
+        time_s: of this call, s: when its odometry was measured, or counted in the middle of training's periods.
 
     Example:
         >>> periods = ControlPeriods((0.12, 0.16))
@@ -25,6 +26,7 @@ class ControlPeriods:
 
     def __init__(self, period_s: tuple[float, float]) -> None:
         self._period_s = period_s
+        self._middle_s = sum(period_s) / 2.0
         self.reset()
 
     def reset(self) -> None:
@@ -32,6 +34,7 @@ class ControlPeriods:
         self.last: Stamps | None = None
         self._last_asked: Stamps | None = None
         self._refused = 0
+        self.time_s = 0.0
 
     def memory_is_old(self, stamps: Stamps | None) -> bool:
         """Return whether the agent was asked so long ago that its memory is of another situation."""
@@ -50,19 +53,21 @@ class ControlPeriods:
     def elapsed_s(self, stamps: Stamps | None) -> float:
         """Return the time since the agent was asked; without stamps a call is the middle of training's periods."""
         if stamps is None or self._last_asked is None:
-            return (1 + self._refused) * sum(self._period_s) / 2.0
+            return (1 + self._refused) * self._middle_s
         return stamps.scan_s - self._last_asked.scan_s
 
     def accept(self, stamps: Stamps | None, asked: bool) -> None:
         """Take down a call with good input, and whether the agent was asked in it."""
         self._refused = 0
         self.last = stamps
+        self.time_s = self.time_s + self._middle_s if stamps is None else stamps.velocity_s
         if asked:
             self._last_asked = stamps
 
     def refuse(self) -> bool:
         """Count a call with bad input, and return whether after so many the memory is of another situation."""
         self._refused += 1
+        self.time_s += self._middle_s
         if self._refused < _FORGET_AFTER:
             return False
         self.last = self._last_asked = None  # a clock that was set back is a clock

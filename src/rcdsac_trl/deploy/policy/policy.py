@@ -80,7 +80,6 @@ class Policy:
     Attributes:
         config: what the agent is.
         robot: that it drives.
-        latency_s: that it allows for, s.
         measured: what is known of how it drives; None where nothing is.
         fractions: of the quantiles, the midpoints of equal parts of [0, 1], float32 [N].
         default_beta: what ``beta`` is where none is given, the middle of the trained range (-1 for the power law);
@@ -108,7 +107,7 @@ class Policy:
         self._observer = RobotObserver(self.config, latency_s)
         self.guard = _guard_of(self.robot, guard, latency_s)
         self.limits = limits
-        self.latency_s = latency_s
+        self._latency_s = latency_s
         self.navigator = navigator
         self.fractions = fractions_of(num_quantiles)
         self.default_beta = middle_of_range(self.config) if self.config.context == "beta" else None
@@ -155,6 +154,11 @@ class Policy:
         self._networks.acting = acting
         for other in self._others:
             other.acting = acting
+
+    @property
+    def latency_s(self) -> float:
+        """How late commands act that it allows for, s."""
+        return self._latency_s
 
     @property
     def recalibrated(self) -> bool:
@@ -372,7 +376,8 @@ class Policy:
                     sectors.distances_m, sectors.covered, next_two, measured, elapsed_s, on_map
                 )
                 next_two, context = self._advice.waypoints, bolder(self.config, context, self._advice.boldness)
-            self._see(*self._observer.observe(sectors, next_two, measured, elapsed_s), context)
+            seen = self._observer.observe(sectors, next_two, measured, elapsed_s, self._periods.time_s)
+            self._see(*seen, context)
         return self._command(sectors, measured, fresh, fresh and forgot, on_map)
 
     def _see(
@@ -408,7 +413,7 @@ class Policy:
             if on_map is not None and reason and not self.guard.limit(*wish, self._known(sectors), measured, been)[2]:
                 reason += " around what the map shows"
         # Networks are told what the robot was told: the limits are part of the world.
-        self._observer.commanded = (v, omega)
+        self._observer.note((v, omega), self._periods.time_s)
         if reason is not None:
             told = f"limited by {reason}; it ends when the cause does"
         quantiles, value, raw = outlook.quantiles, outlook.value, outlook.raw_quantiles
@@ -423,9 +428,9 @@ class Policy:
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""
-        self._observer.commanded = (0.0, 0.0)
         if self._periods.refuse():
             self._forget()
+        self._observer.note((0.0, 0.0), self._periods.time_s)
         how = "resume() ends it" if self._halted else "it stands until good input comes"
         return Command(0.0, 0.0, True, f"{reason}; {how}")
 

@@ -53,12 +53,19 @@ class RobotObserver:
             self._latency.reset()
         self.commanded = (0.0, 0.0)
 
+    def note(self, command: tuple[float, float], at_s: float) -> None:
+        """Take down what the robot is told, m/s and rad/s, on what was measured at a time."""
+        self.commanded = command
+        if self._latency is not None:
+            self._latency.note(command, at_s)
+
     def observe(
         self,
         sectors: Sectors,
         waypoints: tuple[tuple[float, float], tuple[float, float]],
         measured: tuple[float, float],
         elapsed_s: float,
+        at_s: float = 0.0,
     ) -> tuple[NDArray[np.float32], list[float]]:
         """Return the range observation, float32 [180], and all vector observations, one behind the other.
 
@@ -67,11 +74,12 @@ class RobotObserver:
             waypoints: the next two, x and y in m, robot's frame.
             measured: velocities, m/s and rad/s.
             elapsed_s: since the last observation, 0 at the first, s.
+            at_s: when the velocities were measured, s; read where there is a latency.
         """
         bins = range_observation(sectors.distances_m, self.mask, self._robot.lidar.max_range_m)
         told, ahead = measured, None
         if self._latency is not None:
-            ahead = self._latency.ahead(measured, self.commanded, elapsed_s)
+            ahead = self._latency.ahead(measured, at_s)
             first, second = ahead.seen(np.array(waypoints)).tolist()
             waypoints, told = (tuple(first), tuple(second)), ahead.velocities
         vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *told, *self.commanded]
