@@ -200,6 +200,9 @@ def test_seeds_of_an_agent_that_act_differently_are_not_averaged(tmp_path: Path)
         read_episodes([chooses, before])
     mean = evaluate(tmp_path / "mean", "sac", {NONE: 2}, train_seed=2, acting=choice | {"num_candidates": 1})
     assert len(read_episodes([before, mean]).conditions) == 1
+    late = evaluate(tmp_path / "late", "sac", {NONE: 2}, train_seed=3, latency_s=0.28)
+    with pytest.raises(UserInputError, match=r"\(acting.num_candidates=1 and .*=1 latency_s=0\.28\)"):
+        read_episodes([before, late])
     other = evaluate(tmp_path / "other", "rcwr", {NONE: 2})  # another agent may
     assert len(read_episodes([chooses, other]).conditions) == 2
 

@@ -114,6 +114,8 @@ class RememberedRanges:
             elapsed_s: since the last observation, 0 at the first, s.
             measured: which sectors say something now, bool [180]; None: all that the sensor has. The others are not
                 read either, so what is remembered there stays.
+            ahead: tell what is remembered as from there, and what moves where it will be then as well as where it was
+                seen; None: as it is now.
 
         Returns:
             float32 [90]. First the nearness of the nearest thing, seen now or remembered, in each of 36 sectors of 10
@@ -140,25 +142,14 @@ class RememberedRanges:
         self._moving = moving
         known = points[: self._number]
         if ahead is not None:
-            known, moving = _moved_on(known, moving, ahead.latency_s)
             pose, (v, omega) = ahead.after(pose), ahead.velocities
+            # What was seen of it just now stays beside it: whoever walks may as well stop.
+            moving = moving.copy()
+            moving[:, :2] += ahead.latency_s * moving[:, 2:4]
         _tell_points(told[:NUM_REMEMBERED_SECTORS], known, pose, self._reach_m)
         _tell_movers(told, moving, pose, self._reach_m)
         told[-2 * NUM_FORESEEN_COMMANDS :] = self._foreseen.nearness(known, moving, pose, v, omega)
         return told
-
-
-def _moved_on(
-    points: NDArray[np.float64], moving: NDArray[np.float64], by_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return what moves where it will be, and the points with those of what is seen moving there, too."""
-    points, later = points.copy(), moving.copy()
-    later[:, :2] += by_s * moving[:, 2:4]
-    for x, y, vx, vy, radius_m, unseen_s in moving:
-        if unseen_s == 0.0:
-            own = np.hypot(points[:, 0] - x, points[:, 1] - y) < radius_m + _MOVER_MARGIN_M
-            points[own, :2] += by_s * np.array([vx, vy])
-    return points, later
 
 
 # ------------------------------------------------------------------------------------------------ compiled
