@@ -148,26 +148,14 @@ class EvaluationSettings:
                 "name what to evaluate: either run=<folder or shipped agent> or baseline=<name>, such as mppi"
             )
         if self.baseline is not None:
-            own_class(self.baseline)  # refuses what is no name
-        if self.baseline is not None and (self.beta is not None or self.collision_weight is not None):
-            raise UserInputError(f"baseline={self.baseline} has neither beta nor collision weight: leave them out")
-        if self.baseline is not None and (self.navigation.replan or self.navigation.watchdog):
-            raise UserInputError(f"baseline={self.baseline} navigates by itself: leave navigation out")
-        if self.baseline is not None and self.latency_s:
-            raise UserInputError(f"baseline={self.baseline} does not allow for a latency: leave latency_s out")
-        if self.latency_s and (self.record or "tail_variance" in (self.beta_controller or ())):
+            self._check_baseline(self.baseline)
+        asked = self.beta_controller or ()
+        if self.latency_s and (self.record or "tail_variance" in asked):
             what = "record=true shows" if self.record else "beta_controller=[tail_variance] reads"
             raise UserInputError(
                 f"{what} what critics expect of what is seen now, and with latency_s agents are told what will be: "
                 "leave one out"
             )
-        if self.baseline is not None and self.half_precision:
-            raise UserInputError(f"baseline={self.baseline} has no weights to be rounded: leave half_precision out")
-        if self.baseline is not None and self.acting.given:
-            raise UserInputError(f"baseline={self.baseline} has no critics to choose by: leave acting out")
-        asked = self.beta_controller or ()
-        if asked and self.baseline is not None:
-            raise UserInputError(f"baseline={self.baseline} has no beta to turn: leave beta_controller out")
         for name in asked:
             if asked.count(name) > 1:
                 raise UserInputError(f"beta_controller={name} is given more than once: name every one once")
@@ -182,6 +170,21 @@ class EvaluationSettings:
         resolve_processes(self.num_workers, self.num_maps)
         runtime.check_device_name(self.device)
         runtime.resolve_threads(self.threads)
+
+    def _check_baseline(self, baseline: str) -> None:
+        """Refuse a baseline that is no name, and what only agents have."""
+        own_class(baseline)
+        agents_alone = {
+            "has neither beta nor collision weight: leave them out": (self.beta, self.collision_weight) != (None, None),
+            "navigates by itself: leave navigation out": self.navigation.replan or self.navigation.watchdog,
+            "does not allow for a latency: leave latency_s out": self.latency_s,
+            "has no weights to be rounded: leave half_precision out": self.half_precision,
+            "has no critics to choose by: leave acting out": self.acting.given,
+            "has no beta to turn: leave beta_controller out": self.beta_controller,
+        }
+        for why, given in agents_alone.items():
+            if given:
+                raise UserInputError(f"baseline={baseline} {why}")
 
     def conditions_of(self, trained: TrainingSettings) -> list[Condition]:
         """Return what the episodes of a map are driven under: every value of beta or weight, then every controller.

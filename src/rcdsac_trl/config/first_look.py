@@ -41,8 +41,7 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     else:
         trained = find_agent(settings.run, settings.checkpoint, half_precision=settings.half_precision).settings()
     settings.conditions_of(trained)
-    if settings.run is not None:
-        settings.latency_of(trained)
+    settings.latency_of(trained)
     chosen = settings.world_of(trained)
     WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=chosen.robot)
     check_maps(chosen.maps, chosen.task.min_path_m, chosen.robot.circumradius_m)

@@ -124,7 +124,7 @@ def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: Chose
         baseline=settings.baseline or PURSUIT,
         one_trip=chosen.barn is not None,
         navigation=settings.navigation,
-        latency_s=0.0 if settings.run is None else settings.latency_of(trained),
+        latency_s=settings.latency_of(trained),
         acting=settings.acting_of(trained),
     )
 

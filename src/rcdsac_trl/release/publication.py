@@ -239,9 +239,8 @@ def _acted(described: Mapping[str, Any], acting: ActingSettings) -> bool:
 
 def _is_helped(described: Mapping[str, Any]) -> bool:
     """Tell whether an evaluation says more, or less, than how an agent drives by itself."""
-    navigated = any((described.get("navigation") or {}).values())
-    foresighted = bool(described.get("latency_s"))
-    return navigated or foresighted or bool(described.get("controller") or described["sampled"])
+    navigated = (described.get("navigation") or {}).values()
+    return any([*navigated, described.get("latency_s"), described.get("controller"), described["sampled"]])
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

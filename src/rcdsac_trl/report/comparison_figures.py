@@ -64,7 +64,7 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
     axes.axvline(0, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
     axes.set_yticks(range(len(others)), [_beside(conditions.iloc[i]) for i in others])
     _dress_rows(axes, len(others))
-    handles = _differencelegend_of(several_seeds(episodes, conditions.iloc[[reference, *others]]))
+    handles = _difference_legend(several_seeds(episodes, conditions.iloc[[reference, *others]]))
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
@@ -76,7 +76,7 @@ def _beside(condition: pd.Series) -> str:
     return f"{name}\n{measure}{setting}" if measure else f"{name}{setting}"
 
 
-def _differencelegend_of(several_seeds: bool) -> list[Line2D]:
+def _difference_legend(several_seeds: bool) -> list[Line2D]:
     """Say what dots and lines of differences are."""
     interval = "mean, 95 % interval over maps"
     handles = [

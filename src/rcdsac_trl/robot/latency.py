@@ -93,7 +93,7 @@ class Latency:
 
     def reset(self) -> None:
         """Forget the commands: whatever they were, the robot goes on as it moves until the next one acts."""
-        # When each begins to act, s, and its velocities; the first acts already.
+        # When each begins to act, s, and its velocities.
         self._commands: deque[tuple[float, float, float]] = deque()
 
     def note(self, command: tuple[float, float], at_s: float) -> None:

@@ -63,6 +63,10 @@ Point = tuple[float, float]
 """x and y in the map frame, m."""
 
 
+AT_ORIGIN = (0.0, 0.0, 0.0)
+"""The robot's pose in its own frame: from there waypoints are observed that are told in it."""
+
+
 def vector_observations(memory_s: float) -> dict[str, int]:
     """Return name and size of every observation of an agent besides ``range``, in the order that networks read them in.
 

@@ -1,4 +1,4 @@
-"""Points on the floor, from a robot's frame to the one that its pose is in, and back."""
+"""Points on the floor, from the frame of a robot, or another thing, to the one that its pose is in, and back."""
 
 import math
 from typing import Any

@@ -9,11 +9,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.robot.latency import Latency
-from rcdsac_trl.robot.observation import range_distances, waypoint_observation, waypoint_positions
+from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
-
-_AT_ORIGIN = (0.0, 0.0, 0.0)
 
 
 class ForesightedPolicy(TensorDictModuleBase):
@@ -78,7 +76,7 @@ class ForesightedPolicy(TensorDictModuleBase):
                 self._times_s[row] += elapsed_s
             ahead = latency.ahead((v, omega), self._times_s[row])
             first, second = ahead.seen(places[row]).tolist()
-            waypoints.append(waypoint_observation(_AT_ORIGIN, first, second))
+            waypoints.append(waypoint_observation(AT_ORIGIN, first, second))
             moving.append([*ahead.velocities, *commanded])
             remembered.append(memory.observe(distances_m[row], v, omega, elapsed_s, ahead=ahead))
         return {

@@ -130,8 +130,9 @@ def map_evaluator(
             policy = _choosing(spec, policy, loss)
     planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
-    foresighted = _foresighted(spec, policy, len(agent_ids)) if spec.latency_s else None
-    policy = foresighted or policy
+    foresighted = None
+    if spec.latency_s:
+        policy = foresighted = _foresighted(spec, policy, len(agent_ids))
     advised_noise = AgentNoise(agent_ids)
     if spec.navigation.replan or spec.navigation.watchdog:
         policy = _navigated(spec, policy, advised_noise)

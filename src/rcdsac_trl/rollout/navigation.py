@@ -13,11 +13,9 @@ from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorS
 from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
 from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 from rcdsac_trl.robot.action import action_of
-from rcdsac_trl.robot.observation import range_distances, waypoint_observation, waypoint_positions
+from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.policies import AgentNoise
-
-_AT_ORIGIN = (0.0, 0.0, 0.0)
 
 
 def navigator_of(
@@ -69,7 +67,7 @@ class NavigatedPolicy(TensorDictModuleBase):
         """Write what the policy writes, acting on what the navigators say; observations stay as they were."""
         asked = tensordict.clone(recurse=False)
         advice = self._advice(tensordict)
-        waypoints = [waypoint_observation(_AT_ORIGIN, *each.waypoints) for each in advice]
+        waypoints = [waypoint_observation(AT_ORIGIN, *each.waypoints) for each in advice]
         asked["waypoint"] = torch.tensor(waypoints, dtype=torch.float32, device="cpu")
         if self._boldest is not None:
             boldness = torch.tensor([[each.boldness] for each in advice], dtype=torch.float32, device="cpu")

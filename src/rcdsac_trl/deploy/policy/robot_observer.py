@@ -7,13 +7,11 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.robot.latency import Latency, check_latency
-from rcdsac_trl.robot.observation import range_observation, waypoint_observation
+from rcdsac_trl.robot.observation import AT_ORIGIN, range_observation, waypoint_observation
 from rcdsac_trl.robot.sectors import Sectors
 
 if TYPE_CHECKING:
     from rcdsac_trl.robot.remembered_ranges import RememberedRanges
-
-_AT_ORIGIN = (0.0, 0.0, 0.0)
 
 
 def _memory_of(config: AgentConfig) -> "RememberedRanges | None":
@@ -82,7 +80,7 @@ class RobotObserver:
             ahead = self._latency.ahead(measured, at_s)
             first, second = ahead.seen(np.array(waypoints)).tolist()
             waypoints, told = (tuple(first), tuple(second)), ahead.velocities
-        vectors = [*waypoint_observation(_AT_ORIGIN, *waypoints), *told, *self.commanded]
+        vectors = [*waypoint_observation(AT_ORIGIN, *waypoints), *told, *self.commanded]
         if self._remembered is not None:
             distances_m, covered = sectors.distances_m, sectors.covered
             vectors += self._remembered.observe(distances_m, *measured, elapsed_s, covered, ahead).tolist()

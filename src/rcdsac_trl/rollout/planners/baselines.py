@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.config.baseline_name import PURSUIT, OwnClass, own_class
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.observation import waypoint_observation
+from rcdsac_trl.robot.observation import AT_ORIGIN, waypoint_observation
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
@@ -59,7 +59,7 @@ def check_baseline(name: str, sensor: str, robot: RobotSettings = PAPER) -> None
     policy = baseline_policy(name, sensor=sensor, agent_ids=[0], seed=0, robot=robot)
     if own_class(name) is None:
         return
-    ahead = waypoint_observation((0.0, 0.0, 0.0), (5.0, 0.0), (5.0, 0.0))
+    ahead = waypoint_observation(AT_ORIGIN, (5.0, 0.0), (5.0, 0.0))
     seen = {
         "range": torch.zeros(1, NUM_BINS),
         "waypoint": torch.tensor([ahead]),

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.robot.planar import seen_from
 from rcdsac_trl.world.maps.geometry import CELL_M, lower_clearance, segment_clearance
 from rcdsac_trl.world.maps.grid_search import keeps_connected
 from rcdsac_trl.world.maps.shapes import Box, Cylinder, solid_arrays
@@ -143,9 +144,8 @@ class ClutterSite:
             if self._clearance(ax, ay, bx, by, _GAP_M) < _GAP_M:
                 return True
         # No side is near anything, so what still overlaps lies wholly inside the new box.
-        centres = np.concatenate([self._boxes[:, :2], self._circles[:, :2]]) - (piece.x, piece.y)
-        cos, sin = math.cos(piece.yaw), math.sin(piece.yaw)
-        local = np.abs(centres @ np.array([[cos, -sin], [sin, cos]]))
+        centres = np.concatenate([self._boxes[:, :2], self._circles[:, :2]])
+        local = np.abs(seen_from(centres, (piece.x, piece.y, piece.yaw)))
         return bool((local < (piece.half_x, piece.half_y)).all(axis=1).any())
 
     def _clearance(self, ax: float, ay: float, bx: float, by: float, limit_m: float) -> float:

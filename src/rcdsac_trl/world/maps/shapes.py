@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.planar import placed
 
 CLEARANCE_MARGIN_M = 0.05
 """Default of what the generator and the planner keep free beyond the robot's radius."""
@@ -54,10 +55,8 @@ class Box:
 
     def corners(self) -> NDArray[np.float64]:
         """Return the corners, counter-clockwise, float64 [4, 2], m."""
-        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-        local = signs * (self.half_x, self.half_y)
-        return local @ np.array([[cos, sin], [-sin, cos]]) + (self.x, self.y)
+        return placed(signs * (self.half_x, self.half_y), (self.x, self.y, self.yaw))
 
 
 @dataclass(frozen=True)
