@@ -2,13 +2,16 @@
 
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
 ``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>`` takes these rows
-of it alone. The comment of a table of the office course names the folder of what ``course`` wrote, that of a table of
-disturbances the files of ``docs/disturbances.py``, in their order. The table of an accelerator is what
+of it alone. A table of seeds names agents of ``results/`` that were trained again, and finds the other trainings in
+``results/seed-*/``. The comment of a table of the office course names the folder of what ``course`` wrote, that of a
+table of disturbances the files of ``docs/disturbances.py``, in their order. The table of an accelerator is what
 ``benchmarks/accelerator.py`` wrote::
 
     <!-- agents: sac-narrow pursuit-narrow -->
     | agent | collisions | ..
     <!-- agents: end -->
+    <!-- seeds: sac-narrow -->
+    <!-- seeds: end -->
     <!-- course: results/course -->
     <!-- course: end -->
     <!-- disturbances: mppi -->
@@ -28,6 +31,8 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.report.card import measured_values
 from rcdsac_trl.report.course_table import course_table
+from rcdsac_trl.report.findings import labels
+from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.report.statistics import compare
 
 Floats = NDArray[np.float64]
@@ -35,6 +40,7 @@ Floats = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 _TABLE = re.compile(r"(<!-- agents: (?!end)([^>]*?) -->\n).*?(<!-- agents: end -->)", re.S)
+_SEEDS = re.compile(r"(<!-- seeds: (?!end)([^>]*?) -->\n).*?(<!-- seeds: end -->)", re.S)
 _COURSE = re.compile(r"(<!-- course: (?!end)(\S+) -->\n).*?(<!-- course: end -->)", re.S)
 _DISTURBANCES = re.compile(r"(<!-- disturbances: (?!end)([^>]*?) -->\n).*?(<!-- disturbances: end -->)", re.S)
 _ACCELERATOR = re.compile(r"(<!-- accelerator: begin -->\n).*?(<!-- accelerator: end -->)", re.S)
@@ -48,6 +54,7 @@ _HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goa
 def renewed(text: str) -> str:
     """Return a document with its tables as the measured numbers have them."""
     text = _TABLE.sub(lambda found: found[1] + table_of(found[2].split()) + found[3], text)
+    text = _SEEDS.sub(lambda found: found[1] + table_of_seeds(_trainings(found[2].split())) + found[3], text)
     text = _COURSE.sub(lambda found: found[1] + table_of_course(ROOT / found[2]) + found[3], text)
     text = _DISTURBANCES.sub(lambda found: found[1] + table_of_disturbances(_driven(found[2].split())) + found[3], text)
     measured = ROOT / "results" / "accelerator.json"
@@ -71,6 +78,38 @@ def _conditions(name: str) -> list[Mapping[str, Any]]:
         return conditions
     by_beta = {condition["beta"]: condition for condition in conditions}
     return [by_beta[float(beta)] for beta in chosen.split(",")]
+
+
+def _trainings(names: Sequence[str]) -> list[Episodes]:
+    """Return what all trainings of each of some agents drove."""
+    folders = [[ROOT / "results" / name, *sorted((ROOT / "results").glob(f"seed-*/{name}"))] for name in names]
+    return [read_episodes(of_agent) for of_agent in folders]
+
+
+def table_of_seeds(agents: Sequence[Episodes]) -> str:
+    """Return how far trainings of the same agents lie apart, Markdown: a row a condition that all of them drove.
+
+    The last row is the standard deviation from one training to another: the root of its mean square over all rows.
+
+    Args:
+        agents: of each the episodes of all its trainings, as many as of any other.
+    """
+    rows, variances = [], []
+    for episodes in agents:
+        seeds = sorted(episodes.table["train_seed"].unique())
+        for (_, condition), label in zip(episodes.conditions.iterrows(), labels(episodes), strict=True):
+            values = [episodes.of(condition, metric) for metric in ("collisions", "reward")]
+            if len(values[0]) < len(seeds):
+                continue
+            of_seeds = np.stack([metric.mean(axis=(1, 2)) for metric in values], axis=1)  # [S, 2]
+            variances.append(of_seeds.var(axis=0, ddof=1))
+            rows.append(
+                [label, *(f"{collisions:.2f} / {reward:.0f}" for collisions, reward in (*of_seeds, of_seeds.mean(0)))]
+            )
+    headings = ["agent", *(f"seed {seed}" for seed in seeds), "mean"]
+    collisions, reward = np.sqrt(np.mean(variances, axis=0))
+    apart = ["standard deviation, one training to another", *([""] * len(seeds)), f"{collisions:.2f} / {reward:.0f}"]
+    return _markdown(headings, [*rows, apart])
 
 
 def table_of_course(folder: Path) -> str:

@@ -29,6 +29,7 @@ from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.verbs import VERBS
 from rcdsac_trl.experiments.optuna_search import make_search
 from rcdsac_trl.experiments.sweep_jobs import make_sweep
+from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.training.setup import check_training
 from tiny import SMALL, first_combinations_only
 
@@ -125,6 +126,25 @@ def test_tables_of_agents_are_what_was_measured() -> None:
     ]
     measured = tables["accelerator_table"]({"device": "cuda", "laptop": {"plain_updates_per_second": 123.456}})
     assert measured.splitlines()[-1] == "| laptop | plain updates per second | 123.5 |"
+
+
+def test_the_table_of_seeds_is_what_all_trainings_drove() -> None:
+    table = runpy.run_path(str(ROOT / "docs" / "tables.py"))["table_of_seeds"]
+    # Two trainings differ by 0.2 collisions and 20 of reward, two others not: variances 0.02 and 200, halved.
+    driven = [("rcwr", 0, 0.1, 500), ("rcwr", 1, 0.3, 520), ("sac", 0, 0.5, 530), ("sac", 1, 0.5, 530)]
+    rows = [(*driven[0][:2], 2.0, *driven[0][2:]), *((agent, seed, 1.0, *of) for agent, seed, *of in driven)]
+    columns = ["agent", "train_seed", "collision_weight", "collisions", "reward"]
+    told = {"sensor": "narrow", "beta": None, "beta_controller": None, "measure": None, "map": 0, "episode": 0}
+    episodes = pd.DataFrame(rows, columns=columns).assign(**told)
+    protocol = {"num_maps": 1, "num_episodes": 1}
+    agents = [Episodes(rows, protocol, pd.DataFrame()) for _, rows in episodes.groupby("agent")]
+    assert table(agents).splitlines() == [  # of w_coll = 2, which one training drove alone, nothing is shown
+        "| agent | seed 0 | seed 1 | mean |",
+        "|---|---|---|---|",
+        "| RCWR w_coll = 1 | 0.10 / 500 | 0.30 / 520 | 0.20 / 510 |",
+        "| SAC w_coll = 1 | 0.50 / 530 | 0.50 / 530 | 0.50 / 530 |",
+        "| standard deviation, one training to another |  |  | 0.10 / 10 |",
+    ]
 
 
 def test_the_table_of_the_course_is_what_was_driven(tmp_path: Path) -> None:
