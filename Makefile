@@ -62,7 +62,7 @@ docs: setup ## build the documentation as a site: build/docs/html/index.html
 
 pictures: setup ## draw the pictures of docs/images anew that need no measurement: some minutes, and Chromium
 	$(BIN)/python -m rcdsac_trl.draw_maps split=validation count=4 out=docs/images/maps.png
-	for name in sensor_pictures learning_study results_figures scaling_figures ways play_film; do $(BIN)/python docs/images/$$name.py || exit 1; done
+	for name in sensor_pictures learning_study results_figures scaling_figures ways office_film play_film; do $(BIN)/python docs/images/$$name.py || exit 1; done
 
 format: setup ## let ruff repair what it can
 	$(BIN)/ruff check --fix .

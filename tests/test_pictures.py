@@ -46,6 +46,21 @@ def test_what_was_measured_of_scaling_is_drawn_within_its_axes(monkeypatch: pyte
         assert axes.xaxis.get_major_formatter()(100_000) == "100,000"
 
 
+def test_the_film_of_the_office_is_of_the_first_run_that_does_not_arrive_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    film = program("office_film", monkeypatch)
+    arrives = [True, True, False, True, False]
+
+    def driven(_: object, repetition: int, *__: str) -> SimpleNamespace:
+        return SimpleNamespace(trace=SimpleNamespace(finished=arrives[repetition]))
+
+    monkeypatch.setattr(film, "driven", driven)
+    repetition, alone = film.chosen(None)
+    assert (repetition, alone.trace.finished) == (2, False)
+    monkeypatch.setattr(film, "MOST_REPETITIONS", 2)
+    with pytest.raises(SystemExit, match="all of 2 runs arrive"):
+        film.chosen(None)
+
+
 class Staged:
     """A drive whose robots begin to touch something in given steps."""
 

@@ -37,6 +37,25 @@ def frames(office: Office, pilot: Pilot, trace: Trace, course: NDArray[np.float6
         uint8 RGB, [480, 960, 3].
     """
     near, far = Renderer(_SIDE_PX, _VIEW_M), Renderer(_SIDE_PX)
+    for step, (scene, collisions) in enumerate(scenes(office, pilot, trace, course)):
+        v = trace.commands[step, 0]
+        left = near.draw(scene, f"{v:.2f} m/s{'  (limited)' if trace.limited[step] else ''}")
+        right = far.draw(scene, f"{title}   {step * PERIOD_S:.0f} s   collisions: {collisions}")
+        yield np.concatenate([left, right], axis=1)
+
+
+def scenes(
+    office: Office, pilot: Pilot, trace: Trace, course: NDArray[np.float64], trail_steps: int = _TRAIL_STEPS
+) -> Iterator[tuple[Scene, int]]:
+    """Yield what there is to draw of each step of a run, and how many collisions there were until then.
+
+    Args:
+        office: where it was driven.
+        pilot: who drove.
+        trace: of the run.
+        course: as it was driven, [k, 2].
+        trail_steps: of how many steps the way driven is shown.
+    """
     follower = PathFollower(course, pilot.config)
     mask = sensor_mask("narrow")
     radii = np.array([mover.radius for mover in office.map.movers])
@@ -53,13 +72,10 @@ def frames(office: Office, pilot: Pilot, trace: Trace, course: NDArray[np.float6
             sensor_mask=mask,
             waypoints=placed(waypoints, trace.estimates[step]),
             movers=np.column_stack([trace.people[step], radii]),
-            trail=[(x, y) for x, y in trace.poses[max(0, step - _TRAIL_STEPS) : step + 1, :2].tolist()],
+            trail=[(x, y) for x, y in trace.poses[max(0, step - trail_steps) : step + 1, :2].tolist()],
             in_contact=bool(trace.in_contact[step]),
         )
-        v = trace.commands[step, 0]
-        left = near.draw(scene, f"{v:.2f} m/s{'  (limited)' if trace.limited[step] else ''}")
-        right = far.draw(scene, f"{title}   {step * PERIOD_S:.0f} s   collisions: {collisions}")
-        yield np.concatenate([left, right], axis=1)
+        yield scene, collisions
 
 
 def _pose(row: NDArray[np.float64]) -> tuple[float, float, float]:
