@@ -9,7 +9,7 @@ class NavigationSettings:
 
     Attributes:
         replan: hand out other waypoints where the way is blocked.
-        watchdog: help an agent that gets nowhere.
+        watchdog: help an agent that stands still.
     """
 
     replan: bool = False

@@ -133,9 +133,8 @@ def map_evaluator(
     foresighted = None
     if spec.latency_s:
         policy = foresighted = _foresighted(spec, policy, len(agent_ids))
-    advised_noise = AgentNoise(agent_ids)
     if spec.navigation.replan or spec.navigation.watchdog:
-        policy = _navigated(spec, policy, advised_noise)
+        policy = _navigated(spec, policy, len(agent_ids))
     if spec.controller is not None:
         policy = adaptive = _adaptive(spec, spec.controller, policy, loss)
         more.append(lambda *_: {"mean_beta": adaptive.mean_betas()})
@@ -145,7 +144,6 @@ def map_evaluator(
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         # By the map's number, so that it does not matter which process drives it.
         noise.begin(spec.seed, "evaluation actions", map_index)
-        advised_noise.begin(spec.seed, "navigated actions", map_index)
         if planner is not None:
             planner.set_map(map_index)
         if foresighted is not None:
@@ -184,13 +182,13 @@ def _choosing(spec: EvaluationSpec, policy: TensorDictModuleBase, loss: bytes | 
     )
 
 
-def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, noise: AgentNoise) -> NavigatedPolicy:
+def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: int) -> NavigatedPolicy:
     """Put navigators around the agents of a policy."""
     algo, robot = spec.trained.algo, spec.world.robot
     boldest = algo.distortion.measure.high if algo.context_key == "risk" else None
     period_s = sum(spec.world.task.motor_steps) / len(spec.world.task.motor_steps) * robot.motor_period_s
     make = partial(_navigator, spec)
-    return NavigatedPolicy(policy, make, robot.sensor_mask(spec.world.sensor), noise, boldest, period_s, robot)
+    return NavigatedPolicy(policy, make, robot.sensor_mask(spec.world.sensor), num_agents, boldest, period_s, robot)
 
 
 def _foresighted(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: int) -> ForesightedPolicy:

@@ -15,7 +15,6 @@ from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
-from rcdsac_trl.rollout.policies import AgentNoise
 
 
 def navigator_of(
@@ -37,8 +36,8 @@ class NavigatedPolicy(TensorDictModuleBase):
         policy: acts on `waypoint`, and on `risk` if its agents are told one.
         make: makes a navigator.
         sensed: which of the 180 sectors the sensor has, bool [180].
-        noise: of the actions that are drawn.
-        boldest: the beta towards which an agent that gets nowhere is turned; None: agents are told none.
+        num_agents: that it acts for.
+        boldest: the beta towards which an agent that stands still is turned; None: agents are told none.
         period_s: of a step, s.
         robot: that is driven.
     """
@@ -48,7 +47,7 @@ class NavigatedPolicy(TensorDictModuleBase):
         policy: TensorDictModuleBase,
         make: Callable[[], Navigator],
         sensed: NDArray[np.bool_],
-        noise: AgentNoise,
+        num_agents: int,
         boldest: float | None,
         period_s: float,
         robot: RobotSettings = PAPER,
@@ -56,9 +55,8 @@ class NavigatedPolicy(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
         self.policy = policy
-        self._navigators = [make() for _ in noise.agent_ids]
+        self._navigators = [make() for _ in range(num_agents)]
         self._sensed = sensed
-        self._noise = noise
         self._boldest = boldest
         self._period_s = period_s
         self._robot = robot
@@ -73,13 +71,10 @@ class NavigatedPolicy(TensorDictModuleBase):
             boldness = torch.tensor([[each.boldness] for each in advice], dtype=torch.float32, device="cpu")
             asked["risk"] = tensordict["risk"] + boldness * (self._boldest - tensordict["risk"])
         asked = self.policy(asked)
-        drawn = torch.tanh(asked["loc"] + asked["scale"] * self._noise.draw())
         action = asked["action"].clone()
         for row, each in enumerate(advice):
             if each.instead is not None:
                 action[row] = torch.tensor(action_of(*each.instead, self._robot), dtype=torch.float32, device="cpu")
-            elif each.draws:
-                action[row] = drawn[row]
         for key in self.policy.out_keys:
             tensordict[key] = asked[key]
         return tensordict.set("action", action)

@@ -45,7 +45,7 @@ class NavigatorSettings:
         blocked_s: for how long it must have been, s: agents drive around small things by themselves, and what walks
             is often gone by then.
         memory_s: what was seen is forgotten after so long, s.
-        watchdog: when it helps an agent that gets nowhere, and how; None: never.
+        watchdog: when it helps an agent that stands still, and how; None: never.
 
     Raises:
         UserInputError: if a value is outside its limits.
@@ -70,14 +70,12 @@ class Advice(NamedTuple):
     Attributes:
         waypoints: the next two, m, in the robot's frame.
         boldness: how far beta is to be turned from what was asked for to its boldest, in [0, 1].
-        draws: whether the action is to be drawn instead of its mean.
         instead: velocities to drive with whatever the agent wants, m/s and rad/s; None: the agent drives.
         been: where the robot has been while it drove ahead, in its frame now, float64 [k, 2], m.
     """
 
     waypoints: tuple[Place, Place]
     boldness: float
-    draws: bool
     instead: tuple[float, float] | None
     been: NDArray[np.float64]
 
@@ -147,14 +145,13 @@ class Navigator:
         self._observe(distances_m, covered, velocity, elapsed_s, pose)
         self._look_far(elapsed_s, pose)
         next_two = self._waypoints(waypoints, elapsed_s) if self.settings.replan else waypoints
-        boldness, draws, instead = 0.0, False, None
+        boldness, instead = 0.0, None
         been = seen_from(np.array(self._trail), self._map.pose)
         if self._watchdog is not None:
-            target = self._placed(waypoints[0])
-            self._watchdog.observe(self._map.place, target, elapsed_s)
-            boldness, draws = self._watchdog.boldness, self._watchdog.draws
+            self._watchdog.observe(self._map.place, elapsed_s)
+            boldness = self._watchdog.boldness
             instead = self._watchdog.way_out(self._map.place, been, next_two[0], elapsed_s)
-        return Advice(next_two, boldness, draws, instead, been)
+        return Advice(next_two, boldness, instead, been)
 
     def _observe(
         self,

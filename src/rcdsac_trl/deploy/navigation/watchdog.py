@@ -1,4 +1,4 @@
-"""Notices that a robot gets nowhere, and what then helps an agent: boldness, chance, and backing off."""
+"""Notices that a robot stands still, and what then helps an agent: boldness, and at last backing off."""
 
 import math
 from dataclasses import dataclass, fields
@@ -12,8 +12,6 @@ Place = tuple[float, float]
 
 # A robot that stays so near to where it was stands still.
 _STILL_M = 0.3
-# A robot that came no nearer than this to its waypoint made no progress; another waypoint is another one.
-_PROGRESS_M, _OTHER_WAYPOINT_M = 0.2, 0.5
 # It backs along where it has been, aiming at what lies so far behind it.
 _BACK_AIM_M = 0.25
 # Slower than it may, m/s; and where it cannot back, it turns, rad/s.
@@ -25,11 +23,9 @@ class WatchdogSettings:
     """When an agent is helped, and how.
 
     Attributes:
-        still_s: a robot that stays within 0.3 m for so long is helped, s: then its actions are drawn instead of their
-            mean, and beta begins to turn towards its boldest.
-        stalled_s: so is one that comes no nearer to its waypoint, s: it may be on a detour.
-        bold_s: from then on, beta turns to its boldest within this, s.
-        back_off_s: so long after that begins, the robot backs off, s.
+        still_s: of a robot that stays within 0.3 m for so long beta begins to turn to its boldest, s.
+        bold_s: it is there after so long, s; where the robot gets on, beta is at once what was asked for.
+        back_off_s: so long after beta begins to turn, the robot backs off, s.
         back_off_m: by this, m; where it cannot, it turns instead.
 
     Raises:
@@ -37,9 +33,8 @@ class WatchdogSettings:
     """
 
     still_s: float = 3.0
-    stalled_s: float = 15.0
     bold_s: float = 3.0
-    back_off_s: float = 5.0
+    back_off_s: float = 12.0
     back_off_m: float = 0.4
 
     def __post_init__(self) -> None:
@@ -61,48 +56,32 @@ class Watchdog:
     Example:
         >>> watchdog = Watchdog(WatchdogSettings())
         >>> for _ in range(46):
-        ...     watchdog.observe((0.0, 0.0), (3.0, 0.0), 0.1)
-        >>> watchdog.draws, round(watchdog.boldness, 2)
-        (True, 0.5)
+        ...     watchdog.observe((0.0, 0.0), 0.1)
+        >>> round(watchdog.boldness, 2)
+        0.5
     """
 
     def __init__(self, settings: WatchdogSettings) -> None:
         self.settings = settings
         self.idle_s = 0.0
         self._anchor: Place | None = None
-        self._still_s = self._stalled_s = 0.0
-        self._waypoint: Place | None = None
-        self._nearest_m = math.inf
+        self._still_s = 0.0
         self._left_m = self._left_s = 0.0
         self._last: Place | None = None
         self._side = 1.0
 
-    def observe(self, here: Place, waypoint: Place, elapsed_s: float) -> None:
-        """Take in where the robot is, and where it is to go.
+    def observe(self, here: Place, elapsed_s: float) -> None:
+        """Take in where the robot is.
 
         Args:
             here: x and y in m, odometry frame.
-            waypoint: the next one, likewise.
             elapsed_s: since the last call, s.
         """
         if self._anchor is None or math.dist(here, self._anchor) > _STILL_M:
             self._anchor, self._still_s = here, 0.0
         else:
             self._still_s += elapsed_s
-        is_other = self._waypoint is None or math.dist(waypoint, self._waypoint) > _OTHER_WAYPOINT_M
-        left_m = math.dist(here, waypoint)
-        if is_other or left_m < self._nearest_m - _PROGRESS_M:
-            self._nearest_m, self._stalled_s = left_m, 0.0
-        else:
-            self._stalled_s += elapsed_s
-        self._waypoint = waypoint
-        settings = self.settings
-        self.idle_s = max(0.0, self._still_s - settings.still_s, self._stalled_s - settings.stalled_s)
-
-    @property
-    def draws(self) -> bool:
-        """Whether actions are to be drawn."""
-        return self.idle_s > 0.0
+        self.idle_s = max(0.0, self._still_s - self.settings.still_s)
 
     @property
     def boldness(self) -> float:
@@ -131,7 +110,7 @@ class Watchdog:
         self._left_m -= moved_m
         self._left_s -= elapsed_s
         if self._left_m <= 0.0 or self._left_s <= 0.0:
-            self._left_s = self._still_s = self._stalled_s = self.idle_s = 0.0
+            self._left_s = self._still_s = self.idle_s = 0.0
             return None
         back = _aim(been)
         if back is None:

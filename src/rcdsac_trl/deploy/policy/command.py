@@ -14,7 +14,7 @@ class Command:
         v_m_per_s: desired linear velocity.
         omega_rad_per_s: desired angular velocity, counter-clockwise.
         stopped: whether the robot stands because it must: bad input, or :meth:`Policy.stop`.
-        reason: why this is not what the agent wanted, and how that ends; None if it is.
+        reason: why this is not what the agent wanted at the beta it was given, and how that ends; None if it is.
         wanted: what the agent wanted, (m/s, rad/s); None where it was not asked.
         quantiles: of the return (the discounted sum of rewards from here on) for what the agent wanted, at
             ``Policy.fractions``, the lower of the critics' each, recalibrated if ``Policy.recalibrated``, float32 [N];

@@ -34,7 +34,6 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.robot.sectors import Sectors
-from rcdsac_trl.seeding import stream
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator
@@ -122,7 +121,6 @@ class Policy:
         self._periods.reset()
         self._told: Outlook | None = None
         self._advice: Advice | None = None
-        self._noise = stream(0, "drawn actions of a policy")
         if self.navigator is not None:
             self.navigator.reset()
         self._others: list[Policy] = []
@@ -134,7 +132,7 @@ class Policy:
     def __copy__(self) -> "Policy":
         """Copy the situation, and share what never changes."""
         copied = object.__new__(type(self))
-        own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_observer", "navigator", "_noise")}
+        own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_observer", "navigator")}
         own |= {name: copy.copy(self.__dict__[name]) for name in ("_networks", "_periods")}
         own["_others"] = [copy.copy(other) for other in self._others]
         copied.__dict__ |= self.__dict__ | own
@@ -384,10 +382,7 @@ class Policy:
         self, bins: NDArray[np.float32], vectors: Sequence[float] | NDArray[np.float32], context: float | None
     ) -> Outlook:
         """Let the networks take a step, and return what they want and expect."""
-        noise = None
-        if self._advice is not None and self._advice.draws:
-            noise = self._noise.standard_normal(2, np.float32)
-        self._told = self._networks.see(bins, vectors, context, noise)
+        self._told = self._networks.see(bins, vectors, context)
         return self._told
 
     def _command(
@@ -406,7 +401,9 @@ class Policy:
             been = self._advice.been
             if self._advice.instead is not None:
                 v, omega = self._advice.instead
-                told = "it got nowhere and backs off; the agent drives on then"
+                told = "it stood still and backs off; the agent drives on then"
+            elif self._advice.boldness > 0.0 and self.config.context == "beta":
+                told = "it stands still, so beta turns to its boldest; it ends when the robot gets on"
         if self.guard is not None:
             wish = v, omega
             v, omega, reason = self.guard.limit(*wish, self._known(sectors, on_map), measured, been)

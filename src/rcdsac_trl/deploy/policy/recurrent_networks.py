@@ -71,25 +71,20 @@ class RecurrentNetworks:
         self._states = np.zeros((self._encoders.number, self._encoders.state_size), dtype=np.float32)
         self.empty = True
 
-    def see(
-        self, bins: Array, vectors: Sequence[float] | Array, context: float | None, noise: Array | None = None
-    ) -> Outlook:
+    def see(self, bins: Array, vectors: Sequence[float] | Array, context: float | None) -> Outlook:
         """Take a step, and return what the agent does then and expects of that.
 
         Args:
             bins: range observation, float32 [180].
             vectors: the vector observations, one behind the other, [k].
             context: what it is told besides, see :func:`~rcdsac_trl.deploy.policy.context.context_of`.
-            noise: standard normal numbers with which its action is drawn, float32 [2]; None: it acts as
-                :attr:`acting` says.
         """
         weight = (context,) if self._config.context == "collision_weight" and context is not None else ()
         told = np.array((*vectors, *weight), dtype=np.float32)
         self._states = self._encoders.step(bins, told, self._states)
         self._read = self._encoders.heads_read(self._states, told)
         self.empty = False
-        drawn = None if noise is None else self._actor.action(self._read[0], self._embedded(context), noise)
-        return self.outlook(context, drawn)
+        return self.outlook(context)
 
     def outlook(self, context: float | None, action: Array | None = None) -> Outlook:
         """Return what the agent does where it stands, or an action [2] in its stead, and what it expects of that."""

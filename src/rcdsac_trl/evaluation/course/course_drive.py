@@ -248,7 +248,7 @@ def drive_course(
             commanded = (command.v_m_per_s, command.omega_rad_per_s)
             moved = world.step(*commanded)
             step = {"distances_m": seen.distances_m, "velocities": velocity, "commands": commanded}
-            limited = not command.stopped and command.reason is not None
+            limited = not command.stopped and commanded != command.wanted
             steps.append(step | {"stopped": command.stopped, "limited": limited})
             touch = world.simulation.touch
             if touch is not None and moved.in_contact and not states[-1]["in_contact"]:
