@@ -431,6 +431,19 @@ def test_it_leads_around_what_blocks_the_way_where_the_command_line_says_so(fold
     assert y > 0.4
 
 
+def test_it_turns_bold_where_it_stands_if_the_command_line_says_so(folder: Path) -> None:
+    bridge, robot = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), "--watchdog"])), Robot()
+    told = []
+    for step in range(60):
+        now_s = 10.0 + PERIOD_S * step
+        standing = odometry(now_s)
+        standing.twist.twist.linear.x = standing.twist.twist.angular.z = 0.0
+        robot.say(scan=laser(now_s), odom=standing, plan=plan(now_s, ((0.0, 0.0), (5.0, 0.0))))
+        told.append(bridge.step(now_s).reason)
+    assert not any("boldest" in str(reason) for reason in told[:21])  # 2.94 s
+    assert "beta turns to its boldest" in str(told[30])
+
+
 def test_it_allows_for_a_latency_where_the_command_line_gives_one(folder: Path) -> None:
     asked = dds_node._parser().parse_args([str(folder), "--latency", "0.2"])
     with pytest.raises(UserInputError, match=r"latency_s=0\.2 is allowed for by what an agent remembers"):

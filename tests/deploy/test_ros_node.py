@@ -197,6 +197,14 @@ def test_it_leads_around_what_blocks_the_way_where_that_is_asked_for(ros_node: A
     assert "the map cannot be read" in node.published[-1].data
 
 
+def test_it_turns_bold_where_it_stands_if_that_is_asked_for(ros_node: Any) -> None:
+    Node.given["watchdog"] = True
+    node = ros_node.PolicyNode()
+    assert node.driver.policy.navigator.settings == NavigatorSettings(replan=False)
+    node.timers[1]()
+    assert not any("map" in told for told in node.told)  # detours alone want one
+
+
 def test_it_allows_for_a_latency_where_that_is_given(ros_node: Any) -> None:
     Node.given["latency_s"] = 0.2
     with pytest.raises(UserInputError, match=r"latency_s=0\.2 is allowed for by what an agent remembers"):

@@ -70,6 +70,7 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
         nan_means=args.nan_means,
         frames=FrameSettings(args.localisation, args.localisation_timeout, args.base_frame),
         detours=args.detours,
+        watchdog=args.watchdog,
     )
     driver.policy.check_beta(args.beta)
     driver.beta = args.beta
@@ -188,6 +189,11 @@ def _parser() -> argparse.ArgumentParser:
         "--detours",
         action="store_true",
         help="lead around what blocks the way for some seconds, and keep clear of what map shows",
+    )
+    parser.add_argument(
+        "--watchdog",
+        action="store_true",
+        help="turn beta to its boldest where the robot stands for some seconds, until it gets on",
     )
     parser.add_argument(
         "--latency",

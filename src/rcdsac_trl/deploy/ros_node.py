@@ -83,6 +83,7 @@ class PolicyNode(Node):
                 self._given("base_frame", "") or None,
             ),
             detours=self._given("detours", False),
+            watchdog=self._given("watchdog", False),
         )
         self._needed = {topic: _CLOUD for _, topic, _ in cameras} or {"scan": _SCAN}
         self._needed |= _NEEDED

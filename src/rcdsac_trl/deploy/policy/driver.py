@@ -64,6 +64,7 @@ class Driver:
         frames: how the robot's place in the path's frame is known; None for the defaults.
         detours: give the policy a navigator that leads around what blocks the way; it needs numba. If a map comes, it
             keeps clear of that, too, and so does the stop zone: of glass, which no sensor sees.
+        watchdog: give the policy a navigator that turns beta to its boldest where the robot stands; it needs numba.
 
     Attributes:
         beta: how much risk to take; None: the policy's default. May be set at any time.
@@ -81,15 +82,18 @@ class Driver:
         nan_means: Meaning = "invalid",
         frames: FrameSettings | None = None,
         detours: bool = False,
+        watchdog: bool = False,
     ) -> None:
         check_meaning("zero_means", zero_means)
         check_meaning("nan_means", nan_means)
         self.policy = policy
-        if detours:
+        if detours or watchdog:
             # Here, since a driver without them does without numba.
             from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
+            from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 
-            policy.navigator = Navigator(NavigatorSettings(watchdog=None), policy.robot)
+            settings = NavigatorSettings(replan=detours, watchdog=WatchdogSettings() if watchdog else None)
+            policy.navigator = Navigator(settings, policy.robot)
         self.beta: float | None = None
         self.situation: Situation | None = None
         self._robot = policy.config.robot
@@ -168,8 +172,9 @@ class Driver:
 
     @property
     def lacks_map(self) -> bool:
-        """Whether a map would be of use, and none has come."""
-        return self.policy.navigator is not None and self.policy.navigator.static_layer is None
+        """Whether detours could be planned on a map, and none has come."""
+        navigator = self.policy.navigator
+        return navigator is not None and navigator.settings.replan and navigator.static_layer is None
 
     def on_path(self, message: Any) -> None:
         """Take a ``nav_msgs/Path``; the goal is its last pose. One without poses means: stand."""
