@@ -15,6 +15,7 @@ from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.navigation.watchdog import Watchdog, WatchdogSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.world.sim.lidar import sector_distances
 from robots import AHEAD, OPEN, STANDING, agent
@@ -123,24 +124,40 @@ def test_a_standstill_makes_bold_then_backs_off_and_begins_anew() -> None:
     told = []
     for _ in range(60):
         dog.observe((0.0, 0.0), 0.1)
-        told.append((round(dog.boldness, 2), dog.way_out((0.0, 0.0), been, (2.0, 0.0), 0.1)))
+        told.append((round(dog.boldness, 2), dog.way_out((0.0, 0.0), been, 0.1)))
     assert told[19] == (0.0, None)
     assert told[30] == (0.5, None)
     assert told[45] == (1.0, None)
     assert told[52][1] == pytest.approx((-0.15, 0.0))
     for step in range(8):  # it moves
-        way = dog.way_out((-0.06 * step, 0.0), been, (2.0, 0.0), 0.1)
+        way = dog.way_out((-0.06 * step, 0.0), been, 0.1)
     assert way is None
     assert dog.boldness == 0.0
 
 
-def test_who_cannot_back_turns_towards_the_waypoint() -> None:
-    for side in (-1.0, 1.0):
-        dog = Watchdog(SETTINGS)
-        for _ in range(60):
-            dog.observe((0.0, 0.0), 0.1)
-        way = dog.way_out((0.0, 0.0), np.zeros((1, 2)), (-1.0, side), 0.1)
-        assert way == (0.0, side * 0.8)
+def stood(robot: RobotSettings = PAPER) -> Watchdog:
+    """Return a watchdog of a robot that has stood for 6 s, twice as long as it takes until it backs off."""
+    dog = Watchdog(SETTINGS, robot)
+    for _ in range(60):
+        dog.observe((0.0, 0.0), 0.1)
+    return dog
+
+
+STRAIGHT = np.column_stack([np.linspace(-1.0, 0.0, 51), np.zeros(51)])
+
+
+def test_who_has_been_nowhere_else_or_cannot_reverse_is_left_to_its_agent() -> None:
+    assert stood().way_out((0.0, 0.0), np.zeros((1, 2)), 0.1) is None
+    for reverse, back in ((0.0, None), (0.05, (-0.05, 0.0)), (1.0, (-0.15, 0.0))):
+        robot = replace(PAPER, name="mine", max_reverse_m_per_s=reverse)
+        assert stood(robot).way_out((0.0, 0.0), STRAIGHT, 0.1) == (None if back is None else pytest.approx(back))
+
+
+def test_what_does_not_move_back_is_let_go_after_a_second() -> None:
+    dog = stood()
+    ways = [dog.way_out((0.0, 0.0), STRAIGHT, 0.125) for _ in range(12)]
+    assert [way is None for way in ways] == [False] * 8 + [True] * 4
+    assert dog.idle_s == 0.0
 
 
 def test_beta_is_what_was_asked_for_as_soon_as_the_robot_gets_on() -> None:
@@ -158,15 +175,15 @@ def test_beta_is_what_was_asked_for_as_soon_as_the_robot_gets_on() -> None:
 def test_it_backs_along_the_arc_that_it_came_by() -> None:
     angles = np.linspace(-1.0, 0.0, 60)
     been = np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])  # on a circle around (0, 1), counter-clockwise
-    dog = Watchdog(SETTINGS)
-    for _ in range(60):
-        dog.observe((0.0, 0.0), 0.1)
-    v, omega = dog.way_out((0.0, 0.0), been, (2.0, 0.0), 0.1) or (0.0, 0.0)
+    v, omega = stood().way_out((0.0, 0.0), been, 0.1) or (0.0, 0.0)
     assert v < 0.0
     assert omega / v == pytest.approx(1.0, rel=0.02)  # the curvature of that circle
 
 
 # ------------------------------------------------------------------------------------------------ the policy
+BOLDEST = 0.0
+
+
 def policy(**options: Any) -> Policy:
     return Policy(agent(), navigator=Navigator(NavigatorSettings(watchdog=SETTINGS)), **options)
 
@@ -175,21 +192,68 @@ def drive(driver: Policy, steps: int, beta: float = -1.5) -> list[Any]:
     return [driver.act(OPEN, AHEAD, STANDING, beta) for _ in range(steps)]
 
 
-def test_a_policy_turns_bold_and_backs_off_where_it_stands_and_says_so() -> None:
+def test_a_policy_turns_bold_where_it_stands_and_says_so() -> None:
     still, plain, bold = policy(guard=None), Policy(agent(), guard=None), Policy(agent(), guard=None)
     told, untouched = drive(still, 45), drive(plain, 45)
     # 2 s are 14 periods of 0.14 s: until then nothing is changed.
     assert [each.wanted for each in told[:14]] == [each.wanted for each in untouched[:14]]
     assert {each.reason for each in told[:14]} == {None}
     # After 2 s more it acts at the boldest beta, and memory does not depend on beta.
-    boldest = bold.config.context_range[1] if bold.config.context_range else 0.0
-    for turned, asked in zip(told[30:33], drive(bold, 33, boldest)[30:33], strict=True):
+    for turned, asked in zip(told[30:33], drive(bold, 33, BOLDEST)[30:33], strict=True):
         assert turned.wanted == pytest.approx(asked.wanted, abs=1e-6)
     assert told[30].wanted != pytest.approx(untouched[30].wanted, abs=1e-6)
     assert "beta turns to its boldest" in str(told[30].reason)
-    turning = [each for each in told if "backs off" in str(each.reason)]
-    assert turning
-    assert turning[0].v_m_per_s == 0.0  # it has been nowhere else, so it turns
+
+
+def test_a_robot_that_braked_backs_off_through_its_stop_zone() -> None:
+    """It is a little farther than it was ever driven to, and nothing is seen behind it."""
+    for speed in (0.2, 0.37, 0.6):
+        driver = policy()
+        for v in (*[speed] * 50, 0.6 * speed, 0.2 * speed):
+            driver.act(OPEN, AHEAD, (v, 0.0), -1.5)
+        told, v = [], 0.0
+        for _ in range(60):
+            told.append(driver.act(OPEN, AHEAD, (v, 0.0), -1.5))
+            v = min(told[-1].v_m_per_s, 0.0)  # something holds it wherever it drives ahead
+        backwards = [each for each in told if each.v_m_per_s < 0.0]
+        assert 18 <= len(backwards) <= 22, speed  # 0.4 m
+        assert {each.reason for each in backwards} == {"it stood still and backs off; the agent drives on then"}
+
+
+def test_what_happens_while_it_is_stopped_is_no_standstill_and_its_places_are_forgotten() -> None:
+    for stopped in (3, 300):  # in calls; nobody knows whether it was pushed
+        driver = policy(guard=None)
+        for v in [0.5] * 20 + [0.0] * 30:
+            bold = driver.act(OPEN, AHEAD, (v, 0.0), -1.5)
+        assert "boldest" in str(bold.reason)
+        driver.stop()
+        for _ in range(stopped):
+            driver.act(OPEN, AHEAD, STANDING, -1.5)
+        driver.resume()
+        again = [driver.act(OPEN, AHEAD, STANDING, -1.5) for _ in range(14)]
+        assert {each.reason for each in again} == {None}
+        assert driver._advice is not None
+        np.testing.assert_allclose(driver._advice.been, 0.0)
+
+
+def test_without_its_navigator_a_policy_is_advised_no_more() -> None:
+    driver = policy(guard=None)
+    drive(driver, 30)
+    driver.navigator = None
+    assert drive(driver, 1)[0].reason is None
+    assert driver._advice is None
+
+
+def test_who_is_at_its_boldest_already_is_not_said_to_turn() -> None:
+    driver = policy(guard=None)
+    assert {each.reason for each in drive(driver, 30, beta=BOLDEST)} == {None}
+
+
+def test_both_are_said_where_it_is_bold_and_limited() -> None:
+    driver = policy(guard=Guard(max_speed_m_per_s=1e-3))
+    reason = str(drive(driver, 30)[-1].reason)
+    assert "limited by the speed limit" in reason
+    assert reason.endswith("it stands still, so beta turns to its boldest until it gets on")
 
 
 def test_an_advised_policy_repeats_and_copies() -> None:

@@ -44,12 +44,12 @@ class Told(TensorDictModuleBase):
         return tensordict.update({"loc": torch.atanh(stand), "scale": torch.full_like(stand, 0.1), "action": stand})
 
 
-def observation(begins: bool) -> TensorDict:
-    """Two agents with the same waypoints: before the first is a wall, before the second nothing."""
+def observation(begins: bool, v: float = 0.0) -> TensorDict:
+    """Two agents with the same waypoints and speed: before the first is a wall, before the second nothing."""
     ranges = [sector_distances(0.0, 0.0, 0.0, WALL, np.empty((0, 3))), np.full(180, np.inf)]
     seen = np.stack([range_observation(each, FULL) for each in ranges])
     waypoint = torch.tensor([waypoint_observation((0.0, 0.0, 0.0), *AHEAD)] * 2, dtype=torch.float32)
-    told = {"range": torch.from_numpy(seen), "waypoint": waypoint, "velocity": torch.zeros(2, 4)}
+    told = {"range": torch.from_numpy(seen), "waypoint": waypoint, "velocity": torch.tensor([[v, 0.0, 0.0, 0.0]] * 2)}
     init = torch.full((2, 1), begins, dtype=torch.bool)
     return TensorDict({**told, "risk": torch.tensor([[0.2], [0.2]]), "is_init": init}, [2])
 
@@ -73,16 +73,17 @@ def test_an_agent_is_told_a_detour_where_its_way_is_blocked_and_the_observation_
         np.testing.assert_allclose(told[1], AHEAD, atol=1e-4)
 
 
-def test_an_agent_that_stands_is_made_bold_and_then_backs_off_or_turns() -> None:
-    dog = WatchdogSettings(still_s=0.5, bold_s=1.0, back_off_s=1.5)
+def test_an_agent_that_stands_is_made_bold_and_then_backs_off() -> None:
+    dog = WatchdogSettings(still_s=1.0, bold_s=1.0, back_off_s=1.5)
     inner, policy = navigated(NavigatorSettings(replan=False, watchdog=dog))
-    actions = [policy(observation(step == 0))["action"].tolist() for step in range(25)]
+    speeds = [0.5] * 10 + [0.0] * 30
+    actions = [policy(observation(step == 0, v))["action"].tolist() for step, v in enumerate(speeds)]
     risks = [told[1] for told in inner.risks]
-    assert risks[:4] == pytest.approx([0.2] * 4)
-    assert risks[-1] == pytest.approx(1.0)
-    assert risks == sorted(risks)
-    assert [action[1] for action in actions[:12]] == [[-0.5, 0.0]] * 12  # the agent's own
-    assert actions[-1][1] == pytest.approx((-0.5, 0.8 / PAPER.max_angular_velocity))  # 0 m/s: it has been nowhere
+    assert risks[:10] == pytest.approx([0.2] * 10)
+    assert risks[26] == pytest.approx(1.0)
+    assert risks[:27] == sorted(risks[:27])
+    assert [action[1] for action in actions[:26]] == [[-0.5, 0.0]] * 26  # the agent's own
+    assert pytest.approx([-0.875, 0.0]) in [action[1] for action in actions[26:]]  # -0.15 m/s
     policy(observation(True))
     assert inner.risks[-1] == pytest.approx([0.2] * 2)  # a new episode begins afresh
 

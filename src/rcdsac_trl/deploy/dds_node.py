@@ -193,7 +193,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--watchdog",
         action="store_true",
-        help="turn beta to its boldest where the robot stands for some seconds, until it gets on",
+        help="where the robot stands for some seconds, turn beta to its boldest, and at last back off",
     )
     parser.add_argument(
         "--latency",

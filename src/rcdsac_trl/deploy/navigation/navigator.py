@@ -19,6 +19,7 @@ from rcdsac_trl.deploy.navigation.static_layer import Pose, StaticLayer
 from rcdsac_trl.deploy.navigation.watchdog import Watchdog, WatchdogSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
+from rcdsac_trl.robot.observation import AT_ORIGIN
 from rcdsac_trl.robot.planar import placed, seen_from
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
@@ -120,7 +121,8 @@ class Navigator:
         self._far_s = 0.0
         self._blocked_s = self._planned_s = 0.0
         self._detour: list[Place] = []
-        self._watchdog = None if self.settings.watchdog is None else Watchdog(self.settings.watchdog)
+        settings = self.settings.watchdog
+        self._watchdog = None if settings is None else Watchdog(settings, self._robot)
 
     def advise(
         self,
@@ -150,7 +152,9 @@ class Navigator:
         if self._watchdog is not None:
             self._watchdog.observe(self._map.place, elapsed_s)
             boldness = self._watchdog.boldness
-            instead = self._watchdog.way_out(self._map.place, been, next_two[0], elapsed_s)
+            instead = self._watchdog.way_out(self._map.place, been, elapsed_s)
+            # While it braked it got a little farther than it was ever driven to.
+            been = np.vstack([been, AT_ORIGIN[:2]])
         return Advice(next_two, boldness, instead, been)
 
     def _observe(
@@ -208,7 +212,7 @@ class Navigator:
     def _look_far(self, elapsed_s: float, pose: Pose | None) -> None:
         """Keep what detours are planned on: what is remembered, and far around it what the map shows."""
         self._far_s += elapsed_s
-        if self.static_layer is None or pose is None:
+        if self.static_layer is None or pose is None or not self.settings.replan:
             self._far = None
         elif self._far is None or self._far_s >= _REPLAN_S:
             standing = placed(self._on_map_within(0.5 * _WIDE_M, pose), self._map.pose)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 
 Place = tuple[float, float]
 
@@ -14,8 +15,8 @@ Place = tuple[float, float]
 _STILL_M = 0.3
 # It backs along where it has been, aiming at what lies so far behind it.
 _BACK_AIM_M = 0.25
-# Slower than it may, m/s; and where it cannot back, it turns, rad/s.
-_BACK_M_PER_S, _TURN_RAD_PER_S = -0.15, 0.8
+# So fast, m/s, where the robot may reverse so fast. One that does not move by so much for so long is held by something.
+_BACK_M_PER_S, _HELD_M, _HELD_S = 0.15, 0.01, 1.0
 
 
 @dataclass(frozen=True)
@@ -24,9 +25,9 @@ class WatchdogSettings:
 
     Attributes:
         still_s: of a robot that stays within 0.3 m for so long beta begins to turn to its boldest, s.
-        bold_s: it is there after so long, s; where the robot gets on, beta is at once what was asked for.
+        bold_s: it is there after so long, s; 0.3 m farther on, beta is at once what was asked for.
         back_off_s: so long after beta begins to turn, the robot backs off, s.
-        back_off_m: by this, m; where it cannot, it turns instead.
+        back_off_m: by this, m, where it has driven ahead before.
 
     Raises:
         UserInputError: if a value is not positive.
@@ -49,6 +50,7 @@ class Watchdog:
 
     Args:
         settings: when it helps, and how.
+        robot: that is watched.
 
     Attributes:
         idle_s: for how long the robot has been in need of help, s; 0: it is not.
@@ -61,14 +63,16 @@ class Watchdog:
         0.5
     """
 
-    def __init__(self, settings: WatchdogSettings) -> None:
+    def __init__(self, settings: WatchdogSettings, robot: RobotSettings = PAPER) -> None:
         self.settings = settings
         self.idle_s = 0.0
+        self._back_m_per_s = min(_BACK_M_PER_S, robot.max_reverse_m_per_s)
         self._anchor: Place | None = None
         self._still_s = 0.0
         self._left_m = self._left_s = 0.0
+        self._held_at: Place | None = None
+        self._held_s = 0.0
         self._last: Place | None = None
-        self._side = 1.0
 
     def observe(self, here: Place, elapsed_s: float) -> None:
         """Take in where the robot is.
@@ -88,35 +92,39 @@ class Watchdog:
         """How far beta is to be turned to its boldest, in [0, 1]."""
         return min(1.0, self.idle_s / self.settings.bold_s)
 
-    def way_out(
-        self, here: Place, been: NDArray[np.float64], waypoint: Place, elapsed_s: float
-    ) -> tuple[float, float] | None:
-        """Return velocities that lead out, m/s and rad/s; None: the agent may try.
+    def way_out(self, here: Place, been: NDArray[np.float64], elapsed_s: float) -> tuple[float, float] | None:
+        """Return velocities that lead back, m/s and rad/s; None: the agent may try.
 
         Args:
             here: x and y in m, odometry frame.
             been: where the robot has been, in its frame now, the newest last, [k, 2], m.
-            waypoint: the next one, in its frame, m.
             elapsed_s: since the last call, s.
         """
         moved_m = 0.0 if self._last is None else math.dist(here, self._last)
         self._last = here
+        back = _aim(been)
         if self._left_s <= 0.0:
-            if self.idle_s < self.settings.back_off_s:
+            if self.idle_s < self.settings.back_off_s or back is None or self._back_m_per_s == 0.0:
                 return None
             self._left_m = self.settings.back_off_m
-            self._left_s = 2.0 * self._left_m / abs(_BACK_M_PER_S)
-            self._side = 1.0 if waypoint[1] >= 0.0 else -1.0
-        self._left_m -= moved_m
-        self._left_s -= elapsed_s
-        if self._left_m <= 0.0 or self._left_s <= 0.0:
+            self._left_s = 2.0 * self._left_m / self._back_m_per_s
+            self._held_at = None
+        else:
+            self._left_m -= moved_m
+            self._left_s -= elapsed_s
+        if back is None or self._left_m <= 0.0 or self._left_s <= 0.0 or self._is_held(here, elapsed_s):
             self._left_s = self._still_s = self.idle_s = 0.0
             return None
-        back = _aim(been)
-        if back is None:
-            return 0.0, self._side * _TURN_RAD_PER_S
         x, y = back
-        return _BACK_M_PER_S, _BACK_M_PER_S * 2.0 * y / (x * x + y * y)
+        return -self._back_m_per_s, -self._back_m_per_s * 2.0 * y / (x * x + y * y)
+
+    def _is_held(self, here: Place, elapsed_s: float) -> bool:
+        """Say whether a robot that backs off has not moved for a while."""
+        if self._held_at is None or math.dist(here, self._held_at) > _HELD_M:
+            self._held_at, self._held_s = here, 0.0
+        else:
+            self._held_s += elapsed_s
+        return self._held_s >= _HELD_S
 
 
 def _aim(been: NDArray[np.float64]) -> Place | None:

@@ -64,7 +64,8 @@ class Driver:
         frames: how the robot's place in the path's frame is known; None for the defaults.
         detours: give the policy a navigator that leads around what blocks the way; it needs numba. If a map comes, it
             keeps clear of that, too, and so does the stop zone: of glass, which no sensor sees.
-        watchdog: give the policy a navigator that turns beta to its boldest where the robot stands; it needs numba.
+        watchdog: give the policy a navigator that turns beta to its boldest where the robot stands, and at last backs
+            off; it needs numba, and reads the map as detours do.
 
     Attributes:
         beta: how much risk to take; None: the policy's default. May be set at any time.

@@ -113,6 +113,8 @@ class Policy:
         self._networks = RecurrentNetworks(weights, self.fractions, self.config.acting if acting is None else acting)
         self._periods = ControlPeriods(self.config.period_s)
         self._halted = False
+        self._advice: Advice | None = None
+        self._turned = False
         self.reset()
 
     def reset(self) -> None:
@@ -120,9 +122,6 @@ class Policy:
         self._forget()
         self._periods.reset()
         self._told: Outlook | None = None
-        self._advice: Advice | None = None
-        if self.navigator is not None:
-            self.navigator.reset()
         self._others: list[Policy] = []
 
     def __repr__(self) -> str:
@@ -176,9 +175,9 @@ class Policy:
     ) -> NDArray[np.float32]:
         """Return the action for an observation of the Gymnasium or the TorchRL environment.
 
-        Call it once in every step. It does what :meth:`act` does for a robot, without guard, :meth:`stop` and the
-        checks of what a robot's sensors say. Call :meth:`reset` when an episode begins; a TorchRL environment with an
-        ``InitTracker`` says so itself.
+        Call it once in every step. It does what :meth:`act` does for a robot, without guard, navigator, :meth:`stop`
+        and the checks of what a robot's sensors say. Call :meth:`reset` when an episode begins; a TorchRL environment
+        with an ``InitTracker`` says so itself.
 
         Args:
             observation: what the environment returned, a dict or a TensorDict, of one agent or of many: each has a
@@ -369,11 +368,14 @@ class Policy:
         fresh = self._periods.is_due(stamps)
         self._periods.accept(stamps, fresh)
         if fresh:
+            self._advice, self._turned = None, False
             if self.navigator is not None:
                 self._advice = self.navigator.advise(
                     sectors.distances_m, sectors.covered, next_two, measured, elapsed_s, on_map
                 )
-                next_two, context = self._advice.waypoints, bolder(self.config, context, self._advice.boldness)
+                next_two, asked = self._advice.waypoints, context
+                context = bolder(self.config, asked, self._advice.boldness)
+                self._turned = context != asked
             seen = self._observer.observe(sectors, next_two, measured, elapsed_s, self._periods.time_s)
             self._see(*seen, context)
         return self._command(sectors, measured, fresh, fresh and forgot, on_map)
@@ -395,26 +397,24 @@ class Policy:
     ) -> Command:
         outlook = self._told
         assert outlook is not None
-        (v, omega), reason, been = outlook.wanted, None, None
-        told = None
+        (v, omega), been = outlook.wanted, None
+        told = ["it stands still, so beta turns to its boldest until it gets on"] if self._turned else []
         if self._advice is not None:
             been = self._advice.been
             if self._advice.instead is not None:
                 v, omega = self._advice.instead
-                told = "it stood still and backs off; the agent drives on then"
-            elif self._advice.boldness > 0.0 and self.config.context == "beta":
-                told = "it stands still, so beta turns to its boldest; it ends when the robot gets on"
+                told = ["it stood still and backs off; the agent drives on then"]
         if self.guard is not None:
             wish = v, omega
             v, omega, reason = self.guard.limit(*wish, self._known(sectors, on_map), measured, been)
             if on_map is not None and reason and not self.guard.limit(*wish, self._known(sectors), measured, been)[2]:
                 reason += " around what the map shows"
+            if reason is not None:
+                told.insert(0, f"limited by {reason}; it ends when the cause does")
         # Networks are told what the robot was told: the limits are part of the world.
         self._observer.note((v, omega), self._periods.time_s)
-        if reason is not None:
-            told = f"limited by {reason}; it ends when the cause does"
         quantiles, value, raw = outlook.quantiles, outlook.value, outlook.raw_quantiles
-        return Command(v, omega, False, told, outlook.wanted, quantiles, value, fresh, forgot, raw)
+        return Command(v, omega, False, "; ".join(told) or None, outlook.wanted, quantiles, value, fresh, forgot, raw)
 
     def _known(self, sectors: Sectors, on_map: "Pose | None" = None) -> Sectors:
         """Return what the stop zone minds: what is sensed, and what the navigator knows besides."""
@@ -436,5 +436,9 @@ class Policy:
         return context_of(self.config, self.default_beta if beta is None else beta, collision_weight)
 
     def _forget(self) -> None:
+        """Forget what was seen: where the robot has got to since, nobody has told."""
         self._networks.forget()
         self._observer.forget()
+        self._advice, self._turned = None, False
+        if self.navigator is not None:
+            self.navigator.reset()

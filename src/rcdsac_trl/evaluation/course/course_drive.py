@@ -81,7 +81,7 @@ class Trace:
         velocities: measured velocities before the command, m/s and rad/s, float64 [n, 2].
         commands: what was commanded, m/s and rad/s, float64 [n, 2].
         stopped: whether the pilot refused to drive, bool [n].
-        limited: whether speed limit or stop zone changed what the pilot wanted, bool [n].
+        limited: whether speed limit, stop zone or watchdog changed what the pilot wanted, bool [n].
         reached_m: how far along the course it took itself to be at the end, m.
         touches: how contacts began, each with the number of its row.
     """
