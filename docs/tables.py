@@ -20,8 +20,8 @@ table of disturbances the files of ``docs/disturbances.py``, in their order. The
 
 import json
 import re
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +39,6 @@ Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-_TABLE = re.compile(r"(<!-- agents: (?!end)([^>]*?) -->\n).*?(<!-- agents: end -->)", re.S)
-_SEEDS = re.compile(r"(<!-- seeds: (?!end)([^>]*?) -->\n).*?(<!-- seeds: end -->)", re.S)
-_COURSE = re.compile(r"(<!-- course: (?!end)(\S+) -->\n).*?(<!-- course: end -->)", re.S)
-_DISTURBANCES = re.compile(r"(<!-- disturbances: (?!end)([^>]*?) -->\n).*?(<!-- disturbances: end -->)", re.S)
 _ACCELERATOR = re.compile(r"(<!-- accelerator: begin -->\n).*?(<!-- accelerator: end -->)", re.S)
 _COURSE_HEADINGS = (
     *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
@@ -53,13 +49,23 @@ _HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goa
 
 def renewed(text: str) -> str:
     """Return a document with its tables as the measured numbers have them."""
-    text = _TABLE.sub(lambda found: found[1] + table_of(found[2].split()) + found[3], text)
-    text = _SEEDS.sub(lambda found: found[1] + table_of_seeds(_trainings(found[2].split())) + found[3], text)
-    text = _COURSE.sub(lambda found: found[1] + table_of_course(ROOT / found[2]) + found[3], text)
-    text = _DISTURBANCES.sub(lambda found: found[1] + table_of_disturbances(_driven(found[2].split())) + found[3], text)
+    tables: Mapping[str, Callable[[list[str]], str]] = {
+        "agents": table_of,
+        "seeds": lambda names: table_of_seeds(_trainings(names)),
+        "course": lambda folders: table_of_course(*(ROOT / folder for folder in folders)),
+        "disturbances": lambda names: table_of_disturbances(_driven(names)),
+    }
+    for kind, table in tables.items():
+        between = rf"(<!-- {kind}: (?!end)([^>]*?) -->\n).*?(<!-- {kind}: end -->)"
+        text = re.sub(between, partial(_filled, table), text, flags=re.S)
     measured = ROOT / "results" / "accelerator.json"
     values = json.loads(measured.read_text(encoding="utf-8")) if measured.is_file() else None
     return _ACCELERATOR.sub(lambda found: found[1] + accelerator_table(values) + found[2], text)
+
+
+def _filled(table: Callable[[list[str]], str], found: re.Match[str]) -> str:
+    """Return a table between its two comments, of which the first says what it is of."""
+    return found[1] + table(found[2].split()) + found[3]
 
 
 def table_of(names: list[str]) -> str:

@@ -18,8 +18,9 @@ from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.course_settings import PERIOD_S, CourseSettings
 from rcdsac_trl.config.run_config import read_config
-from rcdsac_trl.evaluation.course.course_drive import Conditions, Trace, course_of, drive_course
+from rcdsac_trl.evaluation.course.course_drive import Direction, Trace, course_of, drive_course
 from rcdsac_trl.evaluation.course.course_film import scenes
+from rcdsac_trl.evaluation.course.course_run import conditions_of
 from rcdsac_trl.evaluation.course.entries import Entry, entries_of
 from rcdsac_trl.evaluation.film.episode_film import counted
 from rcdsac_trl.evaluation.film.video import Frame, write_video
@@ -28,7 +29,8 @@ from rcdsac_trl.world.office.building import Office, make_office
 from rcdsac_trl.world.render import Renderer
 
 HERE = Path(__file__).parent
-AGENT, BETA, DIRECTION = "rcdsac_cvar-narrow", 0.25, "reverse"
+AGENT, BETA = "rcdsac_cvar-narrow", 0.25
+DIRECTION: Direction = "reverse"
 HELP = ("navigation.replan=true", "navigation.static_layer=true")
 MOST_REPETITIONS = 20
 # So many steps a frame, and frames a second: a minute in five seconds. It goes on for so long after the arrival, s.
@@ -50,7 +52,7 @@ def driven(office: Office, repetition: int, heading: str, *navigation: str) -> R
     overrides = [f"run={AGENT}", f"beta=[{BETA}]", *navigation]
     settings = read_config(compose("course", overrides), CourseSettings)
     (entry,) = entries_of(settings)
-    conditions = Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed, settings.ranges)
+    conditions = conditions_of(settings)
     trace = drive_course(office, entry.pilot, entry.context, DIRECTION, repetition, conditions, lambda: None)
     return Run(entry, trace, heading)
 
@@ -75,8 +77,7 @@ def panels(office: Office, run: Run) -> Iterator[Frame]:
             said = f"{step * PERIOD_S:.0f} s, {counted(collisions, 'collision')}"
             if is_last and trace.finished:
                 said = f"arrived after {said}"
-            frame = headed(renderer.draw(scene), run.heading, said)
-            yield frame
+            yield (frame := headed(renderer.draw(scene), run.heading, said))
     yield from itertools.repeat(frame)
 
 

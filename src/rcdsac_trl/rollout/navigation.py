@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
 from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
-from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
@@ -23,8 +22,8 @@ def navigator_of(
     """Make what navigates around an agent, on a map if there is one; None where nothing is asked for."""
     if not (settings.replan or settings.watchdog or static_layer is not None):
         return None
-    watchdog = WatchdogSettings() if settings.watchdog else None
-    return Navigator(NavigatorSettings(replan=settings.replan, watchdog=watchdog), robot, static_layer)
+    switched = NavigatorSettings.switched(replan=settings.replan, watchdog=settings.watchdog)
+    return Navigator(switched, robot, static_layer)
 
 
 class NavigatedPolicy(TensorDictModuleBase):

@@ -64,6 +64,16 @@ class NavigatorSettings:
             if not low <= getattr(self, name) < math.inf:
                 raise UserInputError(f"{name}={getattr(self, name)} of a navigator must be at least {low:g} seconds")
 
+    @classmethod
+    def switched(cls, *, replan: bool, watchdog: bool) -> "NavigatorSettings":
+        """Return the defaults of what is switched on, and nothing else.
+
+        Example:
+            >>> NavigatorSettings.switched(replan=True, watchdog=False) == NavigatorSettings(watchdog=None)
+            True
+        """
+        return cls(replan=replan, watchdog=WatchdogSettings() if watchdog else None)
+
 
 class Advice(NamedTuple):
     """What a navigator makes of an observation.

@@ -45,15 +45,35 @@ class WatchdogSettings:
                 raise UserInputError(f"{each.name}={getattr(self, each.name)} of a watchdog must be a positive number")
 
 
+class _Stay:
+    """For how long a robot has stayed near to where it was.
+
+    Args:
+        radius_m: what is near.
+
+    Attributes:
+        lasted_s: for how long, s.
+    """
+
+    def __init__(self, radius_m: float) -> None:
+        self.lasted_s = 0.0
+        self._radius_m = radius_m
+        self._place: Place | None = None
+
+    def observe(self, here: Place, elapsed_s: float) -> None:
+        """Take in where the robot is, and how long after the last call, s."""
+        if self._place is None or math.dist(here, self._place) > self._radius_m:
+            self._place, self.lasted_s = here, 0.0
+        else:
+            self.lasted_s += elapsed_s
+
+
 class Watchdog:
     """Watches one robot.
 
     Args:
         settings: when it helps, and how.
         robot: that is watched.
-
-    Attributes:
-        idle_s: for how long the robot has been in need of help, s; 0: it is not.
 
     Example:
         >>> watchdog = Watchdog(WatchdogSettings())
@@ -65,13 +85,10 @@ class Watchdog:
 
     def __init__(self, settings: WatchdogSettings, robot: RobotSettings = PAPER) -> None:
         self.settings = settings
-        self.idle_s = 0.0
         self._back_m_per_s = min(_BACK_M_PER_S, robot.max_reverse_m_per_s)
-        self._anchor: Place | None = None
-        self._still_s = 0.0
+        self._standing, self._held = _Stay(_STILL_M), _Stay(_HELD_M)
+        # Of a robot that backs off: how far, and for how long, it still may.
         self._left_m = self._left_s = 0.0
-        self._held_at: Place | None = None
-        self._held_s = 0.0
         self._last: Place | None = None
 
     def observe(self, here: Place, elapsed_s: float) -> None:
@@ -81,11 +98,12 @@ class Watchdog:
             here: x and y in m, odometry frame.
             elapsed_s: since the last call, s.
         """
-        if self._anchor is None or math.dist(here, self._anchor) > _STILL_M:
-            self._anchor, self._still_s = here, 0.0
-        else:
-            self._still_s += elapsed_s
-        self.idle_s = max(0.0, self._still_s - self.settings.still_s)
+        self._standing.observe(here, elapsed_s)
+
+    @property
+    def idle_s(self) -> float:
+        """For how long the robot has been in need of help, s; 0: it is not."""
+        return max(0.0, self._standing.lasted_s - self.settings.still_s)
 
     @property
     def boldness(self) -> float:
@@ -102,29 +120,25 @@ class Watchdog:
         """
         moved_m = 0.0 if self._last is None else math.dist(here, self._last)
         self._last = here
+        begins = self._left_s <= 0.0
+        if begins and (self.idle_s < self.settings.back_off_s or self._back_m_per_s == 0.0):
+            return None
         back = _aim(been)
-        if self._left_s <= 0.0:
-            if self.idle_s < self.settings.back_off_s or back is None or self._back_m_per_s == 0.0:
+        if begins:
+            if back is None:
                 return None
             self._left_m = self.settings.back_off_m
             self._left_s = 2.0 * self._left_m / self._back_m_per_s
-            self._held_at = None
+            self._held = _Stay(_HELD_M)
         else:
             self._left_m -= moved_m
             self._left_s -= elapsed_s
-        if back is None or self._left_m <= 0.0 or self._left_s <= 0.0 or self._is_held(here, elapsed_s):
-            self._left_s = self._still_s = self.idle_s = 0.0
+        self._held.observe(here, elapsed_s)
+        if back is None or self._left_m <= 0.0 or self._left_s <= 0.0 or self._held.lasted_s >= _HELD_S:
+            self._left_s = self._standing.lasted_s = 0.0
             return None
         x, y = back
         return -self._back_m_per_s, -self._back_m_per_s * 2.0 * y / (x * x + y * y)
-
-    def _is_held(self, here: Place, elapsed_s: float) -> bool:
-        """Say whether a robot that backs off has not moved for a while."""
-        if self._held_at is None or math.dist(here, self._held_at) > _HELD_M:
-            self._held_at, self._held_s = here, 0.0
-        else:
-            self._held_s += elapsed_s
-        return self._held_s >= _HELD_S
 
 
 def _aim(been: NDArray[np.float64]) -> Place | None:

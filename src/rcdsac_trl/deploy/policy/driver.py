@@ -91,10 +91,9 @@ class Driver:
         if detours or watchdog:
             # Here, since a driver without them does without numba.
             from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
-            from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 
-            settings = NavigatorSettings(replan=detours, watchdog=WatchdogSettings() if watchdog else None)
-            policy.navigator = Navigator(settings, policy.robot)
+            switched = NavigatorSettings.switched(replan=detours, watchdog=watchdog)
+            policy.navigator = Navigator(switched, policy.robot)
         self.beta: float | None = None
         self.situation: Situation | None = None
         self._robot = policy.config.robot
@@ -167,7 +166,7 @@ class Driver:
         """Take a ``nav_msgs/OccupancyGrid``; it means nothing without a navigator."""
         if self.policy.navigator is None:
             return
-        with self._reading("map", "; publish another one, or drive without detours"):
+        with self._reading("map", "; publish another one, or drive without detours and watchdog"):
             self.policy.navigator.static_layer = messages.static_layer_of(message)
             self._map_frame = str(message.header.frame_id)
 

@@ -113,8 +113,7 @@ class Policy:
         self._networks = RecurrentNetworks(weights, self.fractions, self.config.acting if acting is None else acting)
         self._periods = ControlPeriods(self.config.period_s)
         self._halted = False
-        self._advice: Advice | None = None
-        self._turned = False
+        self._advice: Advice | None
         self.reset()
 
     def reset(self) -> None:

@@ -82,7 +82,7 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
     processes = resolve_processes(settings.num_workers, len(jobs))
     simulations = 2 * max(1, processes)  # the physics, and what the cameras see
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, "lower num_workers")
-    conditions = Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed, settings.ranges)
+    conditions = conditions_of(settings)
     office = partial(make_office, settings.people, settings.hollow)
 
     def drives(watch: Watch) -> Generator[Rows, None, None]:
@@ -101,6 +101,11 @@ def make_course(cfg: DictConfig) -> MeasuredRun:
         findings=partial(_findings, office),
         film=partial(_films, office, entries) if settings.record else None,
     )
+
+
+def conditions_of(settings: CourseSettings) -> Conditions:
+    """Return what all runs have in common."""
+    return Conditions(settings.camera, settings.odometry, settings.time_limit_s, settings.seed, settings.ranges)
 
 
 def _described(settings: CourseSettings, entries: Sequence[Entry]) -> dict[str, Any]:
