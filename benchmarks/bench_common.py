@@ -48,9 +48,16 @@ def random_episodes(number: int, steps: int, mask: torch.Tensor, vectors: dict[s
     return TensorDict(content, batch_size=[number, steps])
 
 
-def seconds(call: Callable[[], Any], repeats: int) -> float:
-    """Return the mean time of a call: with one thread this process's own, so that other programs count less."""
-    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
+def seconds(call: Callable[[], Any], repeats: int, threads: int | None = None) -> float:
+    """Return the mean time of a call: with one thread this process's own, so that other programs count less.
+
+    Args:
+        call: is measured.
+        repeats: of it.
+        threads: that it takes; None: as many as torch.
+    """
+    one_thread = (torch.get_num_threads() if threads is None else threads) == 1
+    clock = time.process_time if one_thread else time.perf_counter
     start = clock()
     for _ in range(repeats):
         call()

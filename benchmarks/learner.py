@@ -22,7 +22,8 @@ from rcdsac_trl.system import runtime
 # Mini-batch: overrides of the training's config, updates in a turn, turns.
 BATCHES: dict[str, tuple[list[str], int, int]] = {
     "paper": (["preset=paper"], 1, 3),
-    "laptop": (["preset=laptop"], 5, 7),
+    "laptop": (["preset=laptop", "threads=1"], 5, 7),
+    "laptop, two threads": (["preset=laptop", "threads=2"], 5, 7),
 }
 #: Name of a learner to (registry row, whether it is the product's).
 PLAYERS = {
@@ -133,7 +134,8 @@ def main() -> None:
     results = {
         name: compare([*overrides, *arguments.overrides], *counts) for name, (overrides, *counts) in BATCHES.items()
     }
-    report(results["paper"] | {"laptop": results["laptop"]}, table(results), as_json=arguments.json, out=arguments.out)
+    others = {key: result for key, result in results.items() if key != "paper"}
+    report(results["paper"] | others, table(results), as_json=arguments.json, out=arguments.out)
 
 
 # ------------------------------------------------------------------------------------------------ a player
@@ -150,9 +152,11 @@ def play(name: str, overrides: list[str]) -> None:
 
     in_passes = count_products() if name == "counter" else None
     learner = make_learner(row, overrides)
+    threads = learner.loss.threads
+    # As in a training: the loss has threads of its own. The plain learner knows torch's alone.
+    runtime.set_threads(1 if is_product else threads)
     if not is_product:
         learner = ReferenceLearner(learner)
-    threads = runtime.set_threads(1 if "preset=laptop" in overrides else "auto")
     facts = {
         "sequences": learner.replay.batch_size,
         "steps": learner.replay.sequence_slots - 1,
@@ -162,14 +166,20 @@ def play(name: str, overrides: list[str]) -> None:
     }
 
     def on_one_thread(call: Callable[[], Any]) -> Any:
-        torch.set_num_threads(1)
+        learner.loss.threads = 1
         result = call()
+        learner.loss.threads = threads
+        return result
+
+    def peak() -> float:
         torch.set_num_threads(threads)
+        result = gemm_peak()
+        torch.set_num_threads(1)
         return result
 
     answers: dict[str, Callable[[int], Any]] = {
-        "updates": lambda number: number * seconds(learner.update, number),
-        "peak": lambda _: gemm_peak(),
+        "updates": lambda number: number * seconds(learner.update, number, threads),
+        "peak": lambda _: peak(),
         "flops": lambda _: on_one_thread(lambda: count_flops(learner.update, in_passes)),
         "parts": lambda number: on_one_thread(lambda: time_parts(learner, number)),
         "facts": lambda _: facts,

@@ -33,7 +33,7 @@ def learner_curves() -> dict[str, dict[int, float]]:
             number = sizes.pop("quantiles")
             fractions = [f"learner.num_{kind}={number}" for kind in ("quantiles", "target_quantiles", "risk_samples")]
             overrides = [f"{name}={size}" for name, size in sizes.items()]
-            learners[key, value] = make_learner("rcdsac_pow", ["preset=laptop", *overrides, *fractions])
+            learners[key, value] = make_learner("rcdsac_pow", ["preset=laptop", "threads=1", *overrides, *fractions])
     took: dict[tuple[str, int], list[float]] = {size: [] for size in learners}
     for turn in range(TURNS + 1):
         for size, learner in learners.items():

@@ -24,6 +24,7 @@ WARM_UP = [
     "validation.num_maps=1",
 ]
 SHORTER = [
+    "threads=1",  # the other core is validation's, so that lanes add up
     "task.episode_steps=200",
     "schedule.updates_per_iteration=80",
     *(f"schedule.{name}_iterations=1" for name in ("pursuit", "neutral", "ramp", "decay")),

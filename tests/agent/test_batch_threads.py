@@ -1,6 +1,6 @@
 """A loss computed in parts, each on its own thread, against the same loss in one piece."""
 
-from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -15,13 +15,15 @@ SEQUENCES, STEPS = 7, 4
 
 
 @pytest.fixture(autouse=True)
-def _three_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    before = torch.get_num_threads()
+def _small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    torch.set_num_threads(3)
     monkeypatch.setattr(batch_threads, "_TRANSITIONS_PER_PART", STEPS)
-    yield
-    torch.set_num_threads(before)
+
+
+def make_threaded(kind: str = "rcdsac", **settings: Any) -> DistributionalSACLoss:
+    loss = make_loss(kind, **settings)
+    loss.threads = 3
+    return loss
 
 
 def losses_and_gradients(loss: DistributionalSACLoss, batch: TensorDict) -> tuple[TensorDict, list[Tensor]]:
@@ -42,7 +44,7 @@ def in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_parts_give_the_losses_and_gradients_of_the_whole(
     kind: str, settings: dict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    loss = make_loss(kind, **settings).double()
+    loss = make_threaded(kind, **settings).double()
     batch = make_batch(SEQUENCES, STEPS).apply(lambda x: x.double() if x.is_floating_point() else x)
     found, gradients = losses_and_gradients(loss, batch)
     in_one_piece(monkeypatch)
@@ -53,7 +55,7 @@ def test_parts_give_the_losses_and_gradients_of_the_whole(
 
 
 def test_results_do_not_depend_on_timing() -> None:
-    loss, batch = make_loss(), make_batch(SEQUENCES, STEPS)
+    loss, batch = make_threaded(), make_batch(SEQUENCES, STEPS)
     expected, expected_gradients = losses_and_gradients(loss, batch)
     for _ in range(5):
         found, gradients = losses_and_gradients(loss, batch)
@@ -62,7 +64,7 @@ def test_results_do_not_depend_on_timing() -> None:
 
 
 def test_without_gradients_there_are_no_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    loss, batch = make_loss(), make_batch(SEQUENCES, STEPS)
+    loss, batch = make_threaded(), make_batch(SEQUENCES, STEPS)
     with torch.no_grad():
         found = loss(batch)
     loss.rng_state = torch.Generator().manual_seed(3).get_state()
@@ -71,15 +73,15 @@ def test_without_gradients_there_are_no_parts(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_what_fails_in_a_part_fails_in_the_call() -> None:
-    loss, batch = make_loss(), make_batch(SEQUENCES, STEPS)
+    loss, batch = make_threaded(), make_batch(SEQUENCES, STEPS)
     with pytest.raises(TypeError):
         loss(batch.exclude("velocity"))
     assert losses_and_gradients(loss, batch)[0]["loss_qvalue"].isfinite()
 
 
 def test_parts_are_even_and_not_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert batch_threads.split_batch(SEQUENCES, STEPS) == [slice(0, 2), slice(2, 4), slice(4, 7)]
-    assert batch_threads.split_batch(2, 100) == [slice(0, 1), slice(1, 2)]
+    assert batch_threads.split_batch(SEQUENCES, STEPS, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
+    assert batch_threads.split_batch(2, 100, 3) == [slice(0, 1), slice(1, 2)]
     in_one_piece(monkeypatch)
-    assert batch_threads.split_batch(SEQUENCES, STEPS) == [slice(0, SEQUENCES)]
-    assert batch_threads.split_batch(2 * SEQUENCES, STEPS) == [slice(0, SEQUENCES), slice(SEQUENCES, 2 * SEQUENCES)]
+    assert batch_threads.split_batch(SEQUENCES, STEPS, 3) == [slice(0, SEQUENCES)]
+    assert batch_threads.split_batch(2 * SEQUENCES, STEPS, 3) == [slice(0, SEQUENCES), slice(SEQUENCES, 2 * SEQUENCES)]

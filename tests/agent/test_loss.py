@@ -325,7 +325,7 @@ def test_each_loss_trains_its_own_parameters(kind: str, number: int) -> None:
     assert not any(p.requires_grad for p in loss.target_critic_network_params.values(True, True))
     # The actor's loss goes through the critics: what it would add to their gradients is not even computed.
     for moved in (loss, copy.deepcopy(loss), loss.to(torch.float64)):
-        assert not any(p.requires_grad for critic in moved._frozen_critics for p in critic.parameters())
+        assert not any(p.requires_grad for critic in moved.frozen_critics for p in critic.parameters())
 
 
 def test_every_parameter_is_trained() -> None:

@@ -129,7 +129,8 @@ def _steps_begun_with(settings: TrainingSettings, saved: Saved) -> int:
 
 def _learner_here(settings: TrainingSettings, steps: int) -> Learner:
     """Make the learner on this machine's device, with its threads; its replay begins with so many steps."""
-    runtime.set_threads(settings.threads)
+    # The loss has threads of its own. Torch's, which wait actively, would only take its time.
+    runtime.set_threads(1)
     return make_learner(settings, runtime.resolve_device(settings.device), steps)
 
 

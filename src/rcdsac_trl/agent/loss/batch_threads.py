@@ -19,24 +19,28 @@ from torch.autograd.function import once_differentiable
 _TRANSITIONS_PER_PART = 1024
 
 
-def split_batch(sequences: int, steps: int) -> list[slice]:
-    """Cut a batch into as many parts as torch has threads, fewer where they would be small.
+def split_batch(sequences: int, steps: int, threads: int) -> list[slice]:
+    """Cut a batch into as many parts as there are threads, fewer where they would be small.
 
     Args:
         sequences: of the batch.
         steps: of a sequence.
+        threads: their number.
 
     Example:
-        >>> split_batch(sequences=3, steps=8)
+        >>> split_batch(sequences=3, steps=8, threads=2)
         [slice(0, 3, None)]
     """
-    number = max(1, min(torch.get_num_threads(), sequences * steps // _TRANSITIONS_PER_PART, sequences))
+    number = max(1, min(threads, sequences * steps // _TRANSITIONS_PER_PART, sequences))
     edges = [sequences * part // number for part in range(number + 1)]
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
 
 def parallel_backward(
-    compute: Callable[[slice], dict[str, Tensor]], groups: dict[str, list[nn.Parameter]], parts: list[slice]
+    compute: Callable[[slice], dict[str, Tensor]],
+    groups: dict[str, list[nn.Parameter]],
+    parts: list[slice],
+    threads: int,
 ) -> dict[str, Tensor]:
     """Return the sums of what the parts return; the backward pass of each is done in its thread, too.
 
@@ -46,6 +50,7 @@ def parallel_backward(
         compute: returns a part's contribution to each loss and, without gradient, to each diagnostic; scalars.
         groups: name of each loss, and all the parameters it has a gradient in.
         parts: slices of the batch.
+        threads: that all parts together may take.
     """
     parameters = [parameter for group in groups.values() for parameter in group]
 
@@ -55,29 +60,43 @@ def parallel_backward(
         gradients = torch.autograd.grad(losses.sum(), parameters, materialize_grads=True)
         return {name: value.detach() for name, value in values.items()}, gradients
 
-    pool = _pool(len(parts), max(1, torch.get_num_threads() // len(parts)))
+    pool = thread_pool(len(parts), max(1, threads // len(parts)))
     running = [pool.submit(work, part) for part in parts]
     wait(running)  # where one fails nothing of the others goes on
     (values, gradients), *others = (future.result() for future in running)
     for more_values, more_gradients in others:
         values = {name: value + more_values[name] for name, value in values.items()}
         gradients = torch._foreach_add(gradients, more_gradients)
-    losses = _Known.apply([values[name] for name in groups], list(map(len, groups.values())), gradients, *parameters)
-    return values | dict(zip(groups, losses, strict=True))
+    return values | with_gradients({name: values[name] for name in groups}, groups, gradients)
+
+
+def with_gradients(
+    losses: dict[str, Tensor], groups: dict[str, list[nn.Parameter]], gradients: tuple[Tensor, ...]
+) -> dict[str, Tensor]:
+    """Return losses whose backward pass gives gradients that are known already.
+
+    Args:
+        losses: scalars.
+        groups: name of each loss, and all the parameters it has a gradient in.
+        gradients: of all groups' parameters, one group's behind the other's.
+    """
+    parameters = [parameter for group in groups.values() for parameter in group]
+    known = _Known.apply([losses[name] for name in groups], list(map(len, groups.values())), gradients, *parameters)
+    return dict(zip(groups, known, strict=True))
 
 
 @functools.cache
-def _pool(workers: int, threads: int) -> ThreadPoolExecutor:
+def thread_pool(workers: int, threads: int) -> ThreadPoolExecutor:
     """Return workers each of which lets torch use so many threads for an operation."""
 
     def begin() -> None:
         torch.set_num_threads(threads)
 
-    return ThreadPoolExecutor(workers, "part", begin)
+    return ThreadPoolExecutor(workers, "losses", begin)
 
 
 # A forked process has none of its parent's threads.
-os.register_at_fork(after_in_child=_pool.cache_clear)
+os.register_at_fork(after_in_child=thread_pool.cache_clear)
 
 
 class _Known(torch.autograd.Function):

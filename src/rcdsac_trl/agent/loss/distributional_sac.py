@@ -16,6 +16,7 @@ from rcdsac_trl.agent.loss.batch_threads import parallel_backward, split_batch
 from rcdsac_trl.agent.loss.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
 from rcdsac_trl.agent.loss.linked_loss import LinkedLoss
 from rcdsac_trl.agent.loss.loss_settings import LossSettings
+from rcdsac_trl.agent.loss.network_tasks import backward_in_tasks
 from rcdsac_trl.agent.loss.samples import LossSamples, draw_samples
 from rcdsac_trl.agent.risk import Neutral, RiskMeasure
 
@@ -57,6 +58,8 @@ class DistributionalSACLoss(LinkedLoss):
         reduction: ``"mean"``, ``"sum"`` or ``"none"``; over batch and time. ``"none"`` leaves every entry of the
             output ``[B, L - burn_in]``.
         generator: source of all random numbers; None for one seeded with 0. Its state is part of ``state_dict``.
+        threads: that share a call on a CPU. They take a small batch's networks, step by step, which changes nothing of
+            the result; of a larger batch each takes a part, whose sums are rounded elsewhere.
 
     Example:
         >>> from torchrl.objectives import SoftUpdate
@@ -86,6 +89,7 @@ class DistributionalSACLoss(LinkedLoss):
         measure: RiskMeasure | None = None,
         reduction: Literal["mean", "sum", "none"] = "mean",
         generator: torch.Generator | None = None,
+        threads: int = 1,
     ) -> None:
         """Check the parts against each other, then make them functional."""
         super().__init__()
@@ -102,6 +106,7 @@ class DistributionalSACLoss(LinkedLoss):
             raise ValueError("quantile critics need a risk measure: pass measure=Neutral() for the mean")
         self.measure = measure or Neutral()
         self.reduction = reduction
+        self.threads = threads
         #: How much of beta counts in the actor's loss; the trainer lets it grow from 0 (as if neutral) to 1 (all).
         #: The networks are told the whole beta from the start, so that no value of it is ever new to them.
         self.distortion_strength = 1.0
@@ -125,25 +130,21 @@ class DistributionalSACLoss(LinkedLoss):
             losses, diagnostics = self._losses(tensordict, samples)
             diagnostics["alpha"] = self.alpha.expand_as(losses["loss_actor"])
             return TensorDict(losses | diagnostics, batch_size=losses["loss_actor"].shape)
-        parts = split_batch(*samples.noise.shape[:2])
-        if len(parts) == 1 or not torch.is_grad_enabled() or samples.noise.device.type != "cpu":
-            return TensorDict(self._reduced(tensordict, samples))
-
-        def compute(part: slice) -> dict[str, Tensor]:
-            share = (part.stop - part.start) / len(tensordict)
-            summed = self._trained if self.reduction == "sum" else {}
-            reduced = self._reduced(tensordict[part], samples.rows(part))
-            return {key: value if key in summed else share * value for key, value in reduced.items()}
-
-        return TensorDict(parallel_backward(compute, self._trained, parts))
+        if self.threads > 1 and torch.is_grad_enabled() and samples.noise.device.type == "cpu":
+            sequences, steps = samples.noise.shape[:2]
+            parts = split_batch(sequences, steps, self.threads)
+            if len(parts) > 1:
+                return TensorDict(self._reduced_in_parts(tensordict, samples, parts))
+            if type(self) is DistributionalSACLoss:  # of another one's losses the tasks know nothing
+                return TensorDict(backward_in_tasks(self, tensordict, samples))
+        return TensorDict(self._reduced(tensordict, samples))
 
     def _losses(self, tensordict: TensorDictBase, samples: LossSamples) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return the losses and detached diagnostics, ``[B, L - burn_in]`` but for ``alpha``."""
         actor_memory = self.encode_actor(tensordict)
         loss_qvalue, critic_memories, diagnostics = self.qvalue_loss(tensordict, actor_memory, samples)
         loss_actor, log_prob = self.actor_loss(tensordict, actor_memory, critic_memories, samples)
-        loss_alpha = -self.log_alpha * (log_prob + self.settings.target_entropy)
-        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": loss_alpha}
+        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "loss_alpha": self.alpha_objective(log_prob)}
         return losses, diagnostics | {"alpha": self.alpha, "entropy": -log_prob}
 
     def _reduced(self, tensordict: TensorDictBase, samples: LossSamples) -> dict[str, Tensor]:
@@ -151,6 +152,19 @@ class DistributionalSACLoss(LinkedLoss):
         losses, diagnostics = self._losses(tensordict, samples)
         reduced = {key: _reduce(value, self.reduction) for key, value in losses.items()}
         return reduced | {key: value.mean() for key, value in diagnostics.items()}
+
+    def _reduced_in_parts(
+        self, tensordict: TensorDictBase, samples: LossSamples, parts: list[slice]
+    ) -> dict[str, Tensor]:
+        """Return the same with gradients, from parts of the batch on a thread each."""
+
+        def compute(part: slice) -> dict[str, Tensor]:
+            share = (part.stop - part.start) / len(tensordict)
+            summed = self.trained if self.reduction == "sum" else {}
+            reduced = self._reduced(tensordict[part], samples.rows(part))
+            return {key: value if key in summed else share * value for key, value in reduced.items()}
+
+        return parallel_backward(compute, self.trained, parts, self.threads)
 
     def draw_samples(self, tensordict: TensorDictBase) -> LossSamples:
         """Draw all random numbers that a batch ``[B, L+1]`` needs."""
@@ -165,27 +179,42 @@ class DistributionalSACLoss(LinkedLoss):
 
     def compute_target(self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples) -> Tensor:
         """Return the target samples ``[B, L - burn_in, N']`` (scalar critics: N' = 1), without gradient."""
-        risk = self._risk(tensordict)
-        with torch.no_grad():
-            action, log_prob = self._act(actor_memory[:, 1:], risk, samples.next_noise)
-            _ = self.target_critic_network_params  # TorchRL warns here where nothing updates them
-            values = []
-            for critic in self._target_critics:
-                memory = self._encode(critic, tensordict)[:, 1:]
-                values.append(self._evaluate(critic, memory, action, samples.next_tau, risk))
-            next_value = OVER_CRITICS[self.settings.target_over_critics](values)
-            entropy_bonus = -self.alpha * log_prob.unsqueeze(-1)
-            # What TorchRL's estimator calls, with its shapes: every target fraction gets its own entry.
-            reward = self._transitions(tensordict, ("next", self.tensor_keys.reward)).expand_as(next_value)
-            terminated = self._transitions(tensordict, ("next", self.tensor_keys.terminated)).expand_as(next_value)
-            gamma = self.value_estimator.gamma
+        action, log_prob = self.next_action(tensordict, actor_memory, samples)
+        _ = self.target_critic_network_params  # TorchRL warns here where nothing updates them
+        values = [self.next_value(critic, tensordict, action, samples) for critic in self.target_critics]
+        return self.combine_target(tensordict, values, log_prob)
+
+    @torch.no_grad()
+    def next_action(
+        self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples
+    ) -> tuple[Tensor, Tensor]:
+        """Return a policy action at every next observation, and its log density, without gradient."""
+        return self._act(actor_memory[:, 1:], self._risk(tensordict), samples.next_noise)
+
+    @torch.no_grad()
+    def next_value(
+        self, critic: TensorDictSequential, tensordict: TensorDictBase, action: Tensor, samples: LossSamples
+    ) -> Tensor:
+        """Return what a target critic says of next actions, ``[B, L - burn_in, N']``, without gradient."""
+        memory = self._encode(critic, tensordict)[:, 1:]
+        return self._evaluate(critic, memory, action, samples.next_tau, self._risk(tensordict))
+
+    @torch.no_grad()
+    def combine_target(self, tensordict: TensorDictBase, values: list[Tensor], log_prob: Tensor) -> Tensor:
+        """Return the target samples from what every target critic says of the next actions, and their log density."""
+        next_value = OVER_CRITICS[self.settings.target_over_critics](values)
+        entropy_bonus = -self.alpha * log_prob.unsqueeze(-1)
+        # What TorchRL's estimator calls, with its shapes: every target fraction gets its own entry.
+        reward = self._transitions(tensordict, ("next", self.tensor_keys.reward)).expand_as(next_value)
+        terminated = self._transitions(tensordict, ("next", self.tensor_keys.terminated)).expand_as(next_value)
+        gamma = self.value_estimator.gamma
+        target = td0_return_estimate(gamma, next_value + entropy_bonus, reward, terminated)
+        for _ in range(self.settings.n_steps - 1):
+            # What a step leads to is worth the target of the next step, one step shorter; at the sequence's end
+            # there is none.
+            next_value = torch.cat((target[:, 1:], next_value[:, -1:]), dim=1)
             target = td0_return_estimate(gamma, next_value + entropy_bonus, reward, terminated)
-            for _ in range(self.settings.n_steps - 1):
-                # What a step leads to is worth the target of the next step, one step shorter; at the sequence's end
-                # there is none.
-                next_value = torch.cat((target[:, 1:], next_value[:, -1:]), dim=1)
-                target = td0_return_estimate(gamma, next_value + entropy_bonus, reward, terminated)
-            return target
+        return target
 
     def qvalue_loss(
         self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples
@@ -195,32 +224,69 @@ class DistributionalSACLoss(LinkedLoss):
         The loss ``[B, L - burn_in]`` is summed over the critics; a memory is ``[B, L - burn_in, memory]``.
         """
         target = self.compute_target(tensordict, actor_memory, samples)
-        action, risk, tau = self._transitions(tensordict, self.tensor_keys.action), self._risk(tensordict), samples.tau
-        # No transition starts at the last observation.
-        memories = [self._encode(critic, tensordict, stop=-1) for critic in self._critics]
+        memories = [self.encode_critic(critic, tensordict) for critic in self.critics]
         values = [
-            self._evaluate(critic, memory, action, tau, risk)
-            for critic, memory in zip(self._critics, memories, strict=True)
+            self.predict(critic, tensordict, memory, samples)
+            for critic, memory in zip(self.critics, memories, strict=True)
         ]
-        if tau is None:
-            errors = [F.smooth_l1_loss(value, target, reduction="none").squeeze(-1) for value in values]
-        else:
-            errors = [quantile_huber_loss(value, target, tau, self.settings.kappa) for value in values]
-        return torch.stack(errors).sum(0), memories, self._diagnose(values, target)
+        errors = [self.critic_error(value, target, samples) for value in values]
+        return torch.stack(errors).sum(0), memories, self.diagnose(values, target)
+
+    def encode_critic(self, critic: TensorDictSequential, tensordict: TensorDictBase) -> Tensor:
+        """Return a critic's memory ``[B, L - burn_in, memory]``: no transition starts at the last observation."""
+        return self._encode(critic, tensordict, stop=-1)
+
+    def predict(
+        self, critic: TensorDictSequential, tensordict: TensorDictBase, memory: Tensor, samples: LossSamples
+    ) -> Tensor:
+        """Return what a critic says of the actions taken, ``[B, L - burn_in, N]``."""
+        action = self._transitions(tensordict, self.tensor_keys.action)
+        return self._evaluate(critic, memory, action, samples.tau, self._risk(tensordict))
+
+    def critic_error(self, value: Tensor, target: Tensor, samples: LossSamples) -> Tensor:
+        """Return a critic's share of the critic loss, ``[B, L - burn_in]``."""
+        if samples.tau is None:
+            return F.smooth_l1_loss(value, target, reduction="none").squeeze(-1)
+        return quantile_huber_loss(value, target, samples.tau, self.settings.kappa)
 
     def actor_loss(
         self, tensordict: TensorDictBase, actor_memory: Tensor, critic_memories: list[Tensor], samples: LossSamples
     ) -> tuple[Tensor, Tensor]:
         """Return the actor loss and the detached log density of its action, both ``[B, L - burn_in]``."""
+        action, log_prob = self.policy_action(tensordict, actor_memory, samples)
+        values = [
+            self.policy_value(critic, tensordict, memory, action, samples)
+            for critic, memory in zip(self.frozen_critics, critic_memories, strict=True)
+        ]
+        return self.actor_objective(values, log_prob), log_prob.detach()
+
+    def policy_action(
+        self, tensordict: TensorDictBase, actor_memory: Tensor, samples: LossSamples
+    ) -> tuple[Tensor, Tensor]:
+        """Return a policy action at every observation that a transition starts at, and its log density."""
+        return self._act(actor_memory[:, :-1], self._risk(tensordict), samples.noise)
+
+    def policy_value(
+        self,
+        critic: TensorDictSequential,
+        tensordict: TensorDictBase,
+        memory: Tensor,
+        action: Tensor,
+        samples: LossSamples,
+    ) -> Tensor:
+        """Return the risk-adjusted value ``[B, L - burn_in]`` that a frozen critic gives to actions."""
         risk, tau = self._risk(tensordict), samples.risk_tau
-        action, log_prob = self._act(actor_memory[:, :-1], risk, samples.noise)
         if tau is not None and risk is not None:
             tau = self.measure.psi(tau, self.measure.temper(risk, self.distortion_strength))
-        values = [
-            self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
-            for critic, memory in zip(self._frozen_critics, critic_memories, strict=True)
-        ]
-        return self.alpha * log_prob - minimum(values), log_prob.detach()
+        return self._evaluate(critic, memory.detach(), action, tau, risk).mean(-1)
+
+    def actor_objective(self, values: list[Tensor], log_prob: Tensor) -> Tensor:
+        """Return the actor loss ``[B, L - burn_in]`` from every critic's value of an action, and its log density."""
+        return self.alpha * log_prob - minimum(values)
+
+    def alpha_objective(self, log_prob: Tensor) -> Tensor:
+        """Return the temperature loss ``[B, L - burn_in]``; no gradient reaches the log density."""
+        return -self.log_alpha * (log_prob.detach() + self.settings.target_entropy)
 
     # ------------------------------------------------------------------------------------------- parts of them
     def _encode(self, network: TensorDictSequential, tensordict: TensorDictBase, stop: int | None = None) -> Tensor:
@@ -257,7 +323,8 @@ class DistributionalSACLoss(LinkedLoss):
         }
         return call_module(critic[1], entries)[0]
 
-    def _diagnose(self, values: list[Tensor], target: Tensor) -> dict[str, Tensor]:
+    def diagnose(self, values: list[Tensor], target: Tensor) -> dict[str, Tensor]:
+        """Return detached diagnostics ``[B, L - burn_in]`` of the critics' predictions."""
         with torch.no_grad():
             stacked = torch.stack(values)  # [critics, B, L, N]
             difference = (target.mean(-1) - stacked.mean(-1)).abs().amax(0)

@@ -53,10 +53,17 @@ class LinkedLoss(LossModule):
     target_critic_network_params: TensorDictParams
 
     log_alpha: nn.Parameter
+
+    #: The critics, each an encoder and a head that hold the loss's parameters; their targets; and the critics once
+    #: more, but no gradient reaches their weights.
+    critics: tuple[TensorDictSequential, ...]
+    target_critics: tuple[TensorDictSequential, ...]
+    frozen_critics: tuple[TensorDictSequential, ...]
+
     _generator: torch.Generator
 
     #: The parameters that each loss trains.
-    _trained: dict[str, list[nn.Parameter]]
+    trained: dict[str, list[nn.Parameter]]
 
     def _link_networks(self, actor: TensorDictSequential, critics: Sequence[TensorDictSequential]) -> None:
         """Make the networks functional, with target critics, and link them."""
@@ -65,9 +72,9 @@ class LinkedLoss(LossModule):
         # conversion is stacked, which a recurrent layer without vmap cannot use).
         self.convert_to_functional(nn.ModuleList(critics), "critic_network", create_target_params=True)
         # In tuples, so that their parameters are not listed as this module's own a second time.
-        self._critics = tuple(critics)
-        self._target_critics = tuple(copy.deepcopy(critic) for critic in critics)
-        self._frozen_critics = tuple(copy.deepcopy(critic) for critic in critics)
+        self.critics = tuple(critics)
+        self.target_critics = tuple(copy.deepcopy(critic) for critic in critics)
+        self.frozen_critics = tuple(copy.deepcopy(critic) for critic in critics)
         self._link()
 
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> Self:
@@ -88,7 +95,7 @@ class LinkedLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """Every key the loss reads from a batch."""
         keys: dict[NestedKey, None] = dict.fromkeys(self.actor_network[0].in_keys)
-        for critic in self._critics:
+        for critic in self.critics:
             keys.update(dict.fromkeys(critic[0].in_keys))
         keys[self.tensor_keys.action] = None
         if self._distributional:
@@ -104,13 +111,8 @@ class LinkedLoss(LossModule):
         return [*keys, "quantile_spread"] if self._distributional else keys
 
     @property
-    def critics(self) -> tuple[TensorDictSequential, ...]:
-        """The critics, each an encoder and a head that hold the loss's parameters."""
-        return self._critics
-
-    @property
     def _distributional(self) -> bool:
-        return self.tensor_keys.tau in self._critics[0][1].in_keys
+        return self.tensor_keys.tau in self.critics[0][1].in_keys
 
     @property
     def alpha(self) -> Tensor:
@@ -144,12 +146,12 @@ class LinkedLoss(LossModule):
         self.actor_network_params.to_module(self.actor_network)
         self.critic_network_params.to_module(self.critic_network)
         params = self._modules["target_critic_network_params"]  # the attribute warns before there is an updater
-        params.to_module(nn.ModuleList(self._target_critics))
-        self.critic_network_params.data.to_module(nn.ModuleList(self._frozen_critics))
-        for critic in self._frozen_critics:
+        params.to_module(nn.ModuleList(self.target_critics))
+        self.critic_network_params.data.to_module(nn.ModuleList(self.frozen_critics))
+        for critic in self.frozen_critics:
             critic.requires_grad_(False)  # lent tensors become parameters, which would take gradients again
         of_actor, of_critics = self.actor_network.parameters(), self.critic_network.parameters()
-        self._trained = {"loss_actor": list(of_actor), "loss_qvalue": list(of_critics), "loss_alpha": [self.log_alpha]}
+        self.trained = {"loss_actor": list(of_actor), "loss_qvalue": list(of_critics), "loss_alpha": [self.log_alpha]}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move or cast the parameters, as :meth:`torch.nn.Module.to` does."""
