@@ -670,6 +670,16 @@ def value_varies(value: torch.Tensor) -> bool:
     return bool((value != value.flatten()[0]).any())
 
 
+def test_threads_do_not_change_a_run(tmp_path: Path) -> None:
+    trainers = {}
+    for threads in (1, 3):
+        given = "learner.batch_size=8", f"threads={threads}"  # enough for the compiled twins
+        trainers[threads] = tiny_trainer(tmp_path / str(threads), "rcdsac_pow", *given)
+        assert (trainers[threads].learner.loss.threads, torch.get_num_threads()) == (threads, 1)
+        trainers[threads].run()
+    assert_equal_runs(tmp_path / "1", tmp_path / "3")
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_workers_do_not_change_a_run(
     tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
