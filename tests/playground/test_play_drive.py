@@ -14,9 +14,11 @@ from rcdsac_trl.deploy import Command
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.drivers import AgentDriver
+from rcdsac_trl.playground.page_words import robot_words
 from rcdsac_trl.playground.play_drive import Drive
 from rcdsac_trl.playground.play_session import offers_of
 from rcdsac_trl.playground.scene_choice import SceneChoice
+from rcdsac_trl.playground.view_state import robot_view
 from rcdsac_trl.world.maps.shapes import Box, Map
 from rcdsac_trl.world.office.building import make_office
 from robots import agent
@@ -246,6 +248,37 @@ def test_the_stop_zone_stands_between_who_drives_and_the_wheels(name: str) -> No
         scene.set_stop_zone(False)
         scene.step()
         assert robot.command.reason is None
+
+
+def held(scene: Drive) -> Drive:
+    """Let the wheels stand, whatever they are told."""
+    for robot in scene.robots:
+        step = robot.arena.step
+        robot.arena.step = lambda v, omega, step=step: step(0.0, 0.0)  # type: ignore[method-assign, misc]
+    return scene
+
+
+def test_an_agent_is_led_around_what_blocks_its_way_and_turned_bold_where_it_stands() -> None:
+    with driven(0, beta="-2", second="mppi", detours="on") as scene:
+        robot, planner = held(scene).robots
+        (x, y, _), (x_1, y_1) = robot.arena.simulation.pose, robot.arena.scene().waypoints[0]
+        share = 0.8 / math.dist((x, y), (x_1, y_1))
+        block = x + share * (x_1 - x), y + share * (y_1 - y)
+        scene.put_obstacle(*block)
+        for _ in range(40):  # 6 s
+            scene.step()
+        assert robot.driver.helped == "it stood still: turned to bold"
+        assert (planner.detour, planner.driver.helped) == (None, None)
+        assert robot.detour is not None
+        assert math.dist(robot.detour, block) > 0.3 + robot.driver.robot.circumradius_m - 0.05
+        shown = robot_view(robot, robot.arena.scene(), None)
+        assert shown.detour.tolist() == [[x, y], [*robot.detour]]
+        assert "it stood still: turned to bold" in robot_words(shown)["limited"]
+        scene.set_detours(False)
+        scene.step()
+        assert (robot.detour, robot.driver.helped) == (None, None)
+        assert robot_view(robot, robot.arena.scene(), None).detour.shape == (0, 2)
+        assert not scene.choice.detours
 
 
 def test_contacts_are_counted_when_they_begin_and_shown_where() -> None:

@@ -146,7 +146,7 @@ def test_a_page_of_elsewhere_takes_no_place_with_what_it_does_not_show(
         (
             "bokeh-session-id=x",
             "the link has no key bokeh-session-id: it may have agent, beta, map, seed, sensor, second, beta2, "
-            "stop, theme",
+            "stop, detours, theme",
         ),
     ],
 )

@@ -39,6 +39,7 @@ def test_a_link_says_both_betas_and_leaves_out_what_is_usual() -> None:
         ({"seed": "１"}, "seed=１ is no whole number"),
         ({"seed": "9" * 4000}, r"seed=9{100}\.\. is no whole number"),
         ({"stop": "yes"}, "stop=yes is neither on nor off"),
+        ({"detours": "1"}, "detours=1 is neither on nor off"),
         ({"run": "/etc"}, "the link has no key run: it may have agent, beta"),
     ],
 )

@@ -10,7 +10,7 @@ from scenes_to_play import drive
 
 from rcdsac_trl.agent.risk import MEASURES, CVaR, PowerLaw, make_measure
 from rcdsac_trl.playground.drivers import AgentDriver
-from rcdsac_trl.playground.page_words import _robot_words
+from rcdsac_trl.playground.page_words import robot_words
 from rcdsac_trl.playground.view_state import (
     FINE,
     VALUES_A_SIDE,
@@ -114,7 +114,7 @@ def test_it_is_said_of_a_curve_that_it_is_recalibrated() -> None:
         assert shown.returns is not None
         assert shown.returns.recalibrated == robot.driver.policy.recalibrated
         for told in (False, True):
-            words = _robot_words(replace(shown, returns=replace(shown.returns, recalibrated=told)))["value"]
+            words = robot_words(replace(shown, returns=replace(shown.returns, recalibrated=told)))["value"]
             assert words.endswith("(dashed), recalibrated" if told else "(dashed)")
 
 

@@ -49,6 +49,7 @@ def cast(choice: SceneChoice, offers: Offers) -> list[Part]:
         if choice.map == OFFICE:
             _check_office(part)
         part.driver.guarded = choice.stop
+        part.driver.set_detours(choice.detours)
     return parts
 
 

@@ -78,6 +78,8 @@ class Controls:
         self._hear(speed, "active", visitor.choose_speed)
         self._stop = self._made(Toggle, "stop", label="stop zone", active=False)
         self._hear(self._stop, "active", visitor.switch_stop_zone)
+        self._detours = self._made(Toggle, "detours", label="detours + watchdog", active=False)
+        self._hear(self._detours, "active", visitor.switch_detours)
         self._zoom = self._made(Toggle, "follow", label="zoom in", active=zoomed)
         self._hear(self._zoom, "active", lambda on: zoom())
         self.theme: Toggle = self._made(Toggle, "theme", label="◐", active=False)
@@ -92,6 +94,7 @@ class Controls:
             self._pause,
             speed,
             self._stop,
+            self._detours,
             self._zoom,
             self.theme,
             link,
@@ -139,6 +142,7 @@ class Controls:
             for key, field in self._fields.items():
                 field.update(value=getattr(choice, key))
             self._stop.active = choice.stop
+            self._detours.active = choice.detours
             sides = ("left", "right") if len(view.robots) == 2 else ("",)
             for slider, robot, side in zip(self.betas, view.robots, sides, strict=False):
                 dial = robot.dial

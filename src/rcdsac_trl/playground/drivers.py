@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.deploy import Command, Guard, Policy, Sectors, Weights
+from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller
@@ -94,6 +95,14 @@ class Driver(Protocol):
     """What weighs the return; None where its distribution is not known."""
     guarded: bool
     """Whether the stop zone is on."""
+    detour: tuple[float, float] | None
+    """The corner that it was sent to last instead of its next waypoint, m, in the robot's frame; None: it was not."""
+    helped: str | None
+    """How the watchdog helps it now; None: it does not."""
+
+    def set_detours(self, on: bool) -> None:
+        """Lead it around what blocks its way, and help it where it stands, or let it alone."""
+        ...
 
     def beta(self, dialled: float | None) -> float | None:
         """Return the beta by which the measure weighs the return; None where there is none."""
@@ -130,6 +139,8 @@ class AgentDriver:
         config = weights.config
         self.policy = Policy(weights, guard=None, num_quantiles=NUM_QUANTILES)
         self.robot, self.sensor, self.memory_s = config.robot, config.sensor, config.memory_s
+        self.detour: tuple[float, float] | None = None
+        self.helped: str | None = None
         self.fixed_beta = config.fixed_beta
         self.measure = make_measure(config.measure) if config.critic == "quantile" else None
         self.dial: Dial | None = None
@@ -154,6 +165,12 @@ class AgentDriver:
     def guarded(self, on: bool) -> None:
         self.policy.guard = Guard.of(self.robot) if on else None
 
+    def set_detours(self, on: bool) -> None:
+        """Put detours and a watchdog around the agent, as on a robot, or take them away."""
+        if on != (self.policy.navigator is not None):
+            self.policy.navigator = Navigator(NavigatorSettings(), self.robot) if on else None
+            self.detour = self.helped = None
+
     def beta(self, dialled: float | None) -> float | None:
         """Return the beta by which the measure weighs the return: as dialled, or the one of the training."""
         if self.policy.config.context == "beta":
@@ -171,7 +188,21 @@ class AgentDriver:
         is_weight = self.policy.config.context == "collision_weight"
         beta, weight = (None, dialled) if is_weight else (dialled, None)
         sectors, waypoints, velocity = situation.sectors, situation.waypoints, situation.velocity
-        return self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight)
+        command = self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight)
+        self._note(self.policy.advice, (float(waypoints[0, 0]), float(waypoints[0, 1])))
+        return command
+
+    def _note(self, advice: Advice | None, waypoint: tuple[float, float]) -> None:
+        """Keep what was made of a waypoint that the agent was sent to."""
+        self.detour = self.helped = None
+        if advice is None:
+            return
+        if advice.waypoints[0] != waypoint:
+            self.detour = advice.waypoints[0]
+        if advice.instead is not None:
+            self.helped = "it stood still and backs off"
+        elif advice.boldness > 0.0 and self.policy.config.context is not None:
+            self.helped = "it stood still: turned to bold"
 
     def reconsidered(self, command: Command, dialled: float | None) -> Command:
         """Return a command with what the agent would want with another beta, and what it expects of that."""
@@ -194,6 +225,8 @@ class PlannerDriver:
 
     dial: Dial | None = None
     measure: RiskMeasure | None = None
+    detour: tuple[float, float] | None = None
+    helped: str | None = None
     memory_s = 0.0
 
     def __init__(self, name: str, robot: RobotSettings, sensor: str, seed: int) -> None:
@@ -204,6 +237,9 @@ class PlannerDriver:
         self._guard = Guard.of(robot)
         self._controller: Controller = Dwa(robot=robot) if name == "dwa" else Mppi(robot=robot)
         self.reset()
+
+    def set_detours(self, on: bool) -> None:
+        """Do nothing: it navigates by itself."""
 
     def beta(self, dialled: float | None) -> float | None:
         """Return None: it knows no return."""

@@ -201,13 +201,13 @@ class MapFigure:
             "fill": [colors["silent"]] * len(sensor.silent) + [colors["seen"]] * len(sensor.near),
             "alpha": [0.16] * len(sensor.silent) + [0.30] * len(sensor.near),
         }
-        way = np.concatenate([view.way[:-1], view.way[1:]], axis=1)
-        lines = np.concatenate([sensor.hits, way]).astype(np.float32)
+        way, detour = (np.concatenate([line[:-1], line[1:]], axis=1) for line in (view.way, view.detour))
+        lines = np.concatenate([sensor.hits, way, detour]).astype(np.float32)
         self._sources["lines"].data = {
             **{key: lines[:, column] for column, key in enumerate(_ENDS)},
-            "color": [colors["hit"]] * len(sensor.hits) + [colors["way"]] * len(way),
-            "width": [2.5] * len(sensor.hits) + [1.5] * len(way),
-            "dash": ["solid"] * len(sensor.hits) + ["dashed"] * len(way),
+            "color": [colors["hit"]] * len(sensor.hits) + [colors["way"]] * len(way) + [colors["goal"]] * len(detour),
+            "width": [2.5] * len(sensor.hits) + [1.5] * len(way) + [3.0] * len(detour),
+            "dash": ["solid"] * len(sensor.hits) + ["dashed"] * len(way) + ["solid"] * len(detour),
         }
         self._sources["discs"].data = _discs(view, colors)
         self._sources["marks"].data = _marks(view, colors)
@@ -253,6 +253,8 @@ def _discs(view: RobotView, colors: Colors) -> dict[str, list]:
     rows: list[tuple[float, float, float, str, float, str]] = []
     for x, y in view.way[1:-1].tolist():
         rows.append((x, y, _WAYPOINT_RADIUS_M, colors["floor"], 1.0, colors["way"]))
+    for x, y in view.detour[1:].tolist():
+        rows.append((x, y, _WAYPOINT_RADIUS_M, colors["goal"], 1.0, colors["goal"]))
     x, y = view.way[-1].tolist()
     rows += [
         (x, y, radius, colors["goal"], alpha, colors["goal"])

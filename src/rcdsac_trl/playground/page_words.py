@@ -58,7 +58,7 @@ def view_words(
         "glass": bool(view.glass),
         "rate": f"{shown_per_s:.0f} agent steps/s shown, {view.steps_per_s:.0f} driven" if view.running else "",
         "film": {"told": film[0], "files": list(film[1])},
-        "robots": [_robot_words(robot) for robot in view.robots],
+        "robots": [robot_words(robot) for robot in view.robots],
     }
 
 
@@ -75,7 +75,16 @@ def _dial_words(robot: RobotView) -> dict[str, Any]:
     return {"beta": f"{dial.symbol} = {dialled:.2f}", "word": dial.word(dialled), "ends": list(dial.words)}
 
 
-def _robot_words(robot: RobotView) -> dict[str, Any]:
+def _help_words(robot: RobotView) -> list[str]:
+    """Return what stands between who drives and the wheels now."""
+    words = []
+    if robot.limited is not None and (robot.helped is None or robot.limited.startswith("limited by ")):
+        words.append(f"held by {robot.limited.removeprefix('limited by ').split(';')[0]}")
+    return words if robot.helped is None else [*words, robot.helped]
+
+
+def robot_words(robot: RobotView) -> dict[str, Any]:
+    """Return what a page says of a robot."""
     returns = robot.returns
     value = ""
     if returns is not None:
@@ -86,11 +95,10 @@ def _robot_words(robot: RobotView) -> dict[str, Any]:
         nothing = "A planner: it expects no return."
     elif returns is None and robot.wanted is not None:
         nothing = "Its critics know the mean return alone, no distribution."
-    limited = "" if robot.limited is None else f"held by {robot.limited.removeprefix('limited by ').split(';')[0]}"
     return {
         "name": robot.name,
         **_dial_words(robot),
-        "limited": limited,
+        "limited": ", ".join(_help_words(robot)),
         "speed": f"{robot.speed_m_per_s + 0.0:.2f} m/s",
         "clearance": f"{robot.clearance_m:.2f} m",
         "reward": "–" if robot.reward is None else f"{robot.reward:.1f}",

@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from rcdsac_trl.deploy import Command
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.arenas import MOST_OBSTACLES, OBSTACLE_RADIUS_M, Arena, CourseArena, MapArena
@@ -15,6 +17,7 @@ from rcdsac_trl.playground.cast import cast
 from rcdsac_trl.playground.drivers import AgentDriver, Driver
 from rcdsac_trl.playground.offers import OFFICE, Offers
 from rcdsac_trl.playground.scene_choice import SceneChoice
+from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.world.office.building import make_office
 from rcdsac_trl.world.task.rules import TaskSettings
 
@@ -42,6 +45,7 @@ class Robot:
         contacts: where contacts began, x and y, m.
         in_contact: whether it touches something.
         trail: where it was and how fast, x and y in m and m/s, the latest steps.
+        detour: the corner that it was sent to instead of its next waypoint, x and y, m; None: it was not.
     """
 
     name: str
@@ -56,6 +60,7 @@ class Robot:
     contacts: list[tuple[float, float]] = field(default_factory=list)
     in_contact: bool = False
     trail: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=TRAIL_STEPS))
+    detour: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Begin the trail where the robot starts."""
@@ -70,6 +75,7 @@ class Robot:
     def step(self) -> None:
         """Take one agent step."""
         command = self.driver.act(self.arena.situation(), self.dialled)
+        self.detour = self._on_map(self.driver.detour)
         outcome = self.arena.step(command.v_m_per_s, command.omega_rad_per_s)
         self.command = command
         self.steps += 1
@@ -82,6 +88,13 @@ class Robot:
             self.contacts.append((x, y))
         self.in_contact = outcome.in_contact
         self.goals += outcome.goal_reached
+
+    def _on_map(self, place: tuple[float, float] | None) -> tuple[float, float] | None:
+        """Return a place in the robot's frame in that of the map, m."""
+        if place is None:
+            return None
+        ((x, y),) = placed(np.array([place]), self.arena.simulation.pose).tolist()
+        return x, y
 
 
 class Drive:
@@ -145,6 +158,14 @@ class Drive:
         for robot in self.robots:
             robot.driver.guarded = on
         self.choice = replace(self.choice, stop=on)
+
+    def set_detours(self, on: bool) -> None:
+        """Put detours and a watchdog around all agents, or take them away; planners navigate by themselves."""
+        for robot in self.robots:
+            robot.driver.set_detours(on)
+            if not on:
+                robot.detour = None
+        self.choice = replace(self.choice, detours=on)
 
     def set_goal(self, x: float, y: float) -> None:
         """Send all robots to the place nearest to a point, m, that they can get to."""

@@ -31,6 +31,7 @@ class SceneChoice:
         second: who drives a second robot in a world of the same seed; :data:`NOBODY`: nobody.
         beta2: how much risk that one takes.
         stop: whether a stop zone stands between who drives and the wheels.
+        detours: whether agents are led around what blocks their way, and helped where they stand.
 
     Raises:
         UserInputError: for a seed that is none.
@@ -49,6 +50,7 @@ class SceneChoice:
     second: str = NOBODY
     beta2: float | None = None
     stop: bool = False
+    detours: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what is no seed."""
@@ -136,9 +138,9 @@ def _read(key: str, text: str) -> str | float | int | bool:
         if not (text.isascii() and text.isdigit() and len(text) <= len(str(LARGEST_SEED))):
             raise _no_seed(f"={shortened(text)}" if text else " is empty, which")
         return int(text)
-    if key == "stop":
+    if key in ("stop", "detours"):
         if text not in _SWITCHES:
-            raise UserInputError(f"stop={shortened(text)} is neither on nor off: choose one of them")
+            raise UserInputError(f"{key}={shortened(text)} is neither on nor off: choose one of them")
         return _SWITCHES[text]
     return text
 

@@ -92,6 +92,7 @@ class RobotView:
         arrow: outline of the arrow on it, [4, 2].
         sensor: what it sees.
         way: where it is, then the waypoints ahead, the last one the goal, [k, 2].
+        detour: where it is, then the corner that it was sent to instead of its next waypoint, [2, 2]; [0, 2]: none.
         movers: x, y and radius, [k, 3].
         remembered: points that the agent is told of because it saw them, [k, 2].
         expected: where it expects what moves, x, y and radius, [k, 3].
@@ -105,6 +106,7 @@ class RobotView:
         wanted: speed in m/s and turning rate in degrees/s that the driver wanted; None before the first step.
         told: those that the wheels were told, with the stop zone between.
         limited: why they differ; None if they do not.
+        helped: how the watchdog helps it; None if it does not.
         clearance_m: between the robot's circle and the nearest thing, seen or not.
         reward: so far; None where nothing is paid.
         collisions: so far.
@@ -121,6 +123,7 @@ class RobotView:
     arrow: Array
     sensor: SensorView
     way: Array
+    detour: Array
     movers: Array
     remembered: Array
     expected: Array
@@ -134,6 +137,7 @@ class RobotView:
     wanted: tuple[float, float] | None
     told: tuple[float, float] | None
     limited: str | None
+    helped: str | None
     clearance_m: float
     reward: float | None
     collisions: int
@@ -162,6 +166,7 @@ def robot_view(robot: Robot, scene: Scene, values: ValueView | None) -> RobotVie
         arrow=placed(size * _ARROW, scene.pose),
         sensor=sensor_view(scene),
         way=np.concatenate([[(x, y)], scene.waypoints]),
+        detour=np.empty((0, 2)) if robot.detour is None else np.array([(x, y), robot.detour]),
         movers=scene.movers,
         remembered=scene.remembered,
         expected=scene.expected,
@@ -175,6 +180,7 @@ def robot_view(robot: Robot, scene: Scene, values: ValueView | None) -> RobotVie
         wanted=None if command is None or command.wanted is None else _in_degrees(*command.wanted),
         told=None if command is None else _in_degrees(command.v_m_per_s, command.omega_rad_per_s),
         limited=None if command is None else command.reason,
+        helped=robot.driver.helped,
         clearance_m=max(0.0, simulation.room_at(x, y, _FARTHEST_M) - scene.robot.circumradius_m),
         reward=robot.reward,
         collisions=robot.collisions,

@@ -45,6 +45,10 @@ class Visitor:
         """Put a stop zone between who drives and the wheels, or take it away."""
         self._tell(lambda drive: drive.set_stop_zone(on))
 
+    def switch_detours(self, on: bool) -> None:
+        """Lead agents around what blocks their way, and help where they stand, or let them alone."""
+        self._tell(lambda drive: drive.set_detours(on))
+
     def push(self, side: float) -> None:
         """Push the robots aside: to their left for 1.0, to their right for -1.0."""
         self._tell(lambda drive: drive.push(side))

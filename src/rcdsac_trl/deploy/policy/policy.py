@@ -152,6 +152,11 @@ class Policy:
             other.acting = acting
 
     @property
+    def advice(self) -> "Advice | None":
+        """What the navigator made of what was seen last; None without one, or where nothing was seen."""
+        return self._advice
+
+    @property
     def latency_s(self) -> float:
         """How late commands act that it allows for, s."""
         return self._latency_s
