@@ -63,6 +63,18 @@ def test_results_do_not_depend_on_timing() -> None:
         assert all(map(torch.equal, gradients, expected_gradients))
 
 
+def test_frozen_weights_are_left_alone_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    loss, batch = make_threaded(), make_batch(SEQUENCES, STEPS)
+    frozen = list(loss.critics[0][0].parameters())
+    for parameter in frozen:
+        parameter.requires_grad_(False)
+    _, gradients = losses_and_gradients(loss, batch)
+    in_one_piece(monkeypatch)
+    _, expected = losses_and_gradients(loss, batch)
+    torch.testing.assert_close(gradients, expected)
+    assert all(parameter.grad is None for parameter in frozen)
+
+
 def test_without_gradients_there_are_no_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     loss, batch = make_threaded(), make_batch(SEQUENCES, STEPS)
     with torch.no_grad():

@@ -6,10 +6,22 @@ import pytest
 import torch
 from tensordict import TensorDict
 from test_loss import LOSSES, make_batch, make_loss
-from torch import Tensor
+from torch import Tensor, nn
 
 from rcdsac_trl.agent.loss import distributional_sac
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
+
+
+class Unknown(nn.Module):
+    """A recurrent layer that the package does not know."""
+
+    def __init__(self, gru: nn.GRU) -> None:
+        super().__init__()
+        self.gru, self.hidden_size = gru, gru.hidden_size
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        return self.gru(features)
+
 
 VARIANTS: list[dict[str, Any]] = [
     {},
@@ -53,6 +65,32 @@ def test_they_give_to_the_last_bit_what_one_thread_gives(
         assert (found == expected).all()
         assert len(gradients) == len(expected_gradients)
         assert all(map(torch.equal, gradients, expected_gradients))
+
+
+def test_frozen_and_unused_weights_are_left_alone() -> None:
+    loss, batch = make_loss(), make_batch(7, 5)
+    frozen = [*loss.critics[0][0].parameters(), next(loss.actor_network[1].parameters())]
+    for parameter in frozen:
+        parameter.requires_grad_(False)
+    _, expected = on_threads(loss, batch, threads=1)
+    _, gradients = on_threads(loss, batch, threads=2)
+    assert all(map(torch.equal, gradients, expected))
+    assert all(parameter.grad is None for parameter in frozen)
+
+
+def test_a_loss_alone_leaves_no_gradients_of_the_others() -> None:
+    loss, batch = make_loss(), make_batch(7, 5)
+    loss.threads = 2
+    loss(batch)["loss_actor"].backward()
+    assert all(parameter.grad is None for parameter in loss.trained["loss_qvalue"])
+    assert all(parameter.grad is not None for parameter in loss.trained["loss_actor"])
+
+
+def test_networks_of_others_draw_their_numbers_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    loss, batch = make_loss(), make_batch(7, 5)
+    loss.critics[0][0].module.gru = Unknown(loss.critics[0][0].module.gru)
+    monkeypatch.setattr(distributional_sac, "backward_in_tasks", None)
+    assert on_threads(loss, batch, threads=2)[0]["loss_qvalue"].isfinite()
 
 
 def test_a_loss_that_is_derived_from_it_computes_its_own() -> None:

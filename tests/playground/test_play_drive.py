@@ -261,24 +261,46 @@ def held(scene: Drive) -> Drive:
 def test_an_agent_is_led_around_what_blocks_its_way_and_turned_bold_where_it_stands() -> None:
     with driven(0, beta="-2", second="mppi", detours="on") as scene:
         robot, planner = held(scene).robots
-        (x, y, _), (x_1, y_1) = robot.arena.simulation.pose, robot.arena.scene().waypoints[0]
+        x, y, yaw = robot.arena.simulation.pose
+        scene.set_goal(x + 2.0 * math.cos(yaw), y + 2.0 * math.sin(yaw))  # where it looks
+        x_1, y_1 = robot.arena.scene().waypoints[0]
         share = 0.8 / math.dist((x, y), (x_1, y_1))
         block = x + share * (x_1 - x), y + share * (y_1 - y)
         scene.put_obstacle(*block)
-        for _ in range(40):  # 6 s
+        for _ in range(50):  # 7.5 s
             scene.step()
         assert robot.driver.helped == "it stood still: turned to bold"
         assert (planner.detour, planner.driver.helped) == (None, None)
         assert robot.detour is not None
-        assert math.dist(robot.detour, block) > 0.3 + robot.driver.robot.circumradius_m - 0.05
+        assert math.dist(robot.detour, block) > 0.3  # beside it; of its far side the agent has seen nothing yet
         shown = robot_view(robot, robot.arena.scene(), None)
         assert shown.detour.tolist() == [[x, y], [*robot.detour]]
-        assert "it stood still: turned to bold" in robot_words(shown)["limited"]
+        assert robot_words(shown)["limited"] == "it stood still: turned to bold"
+        assert robot.driver.beta(-2.0) == 0.0  # what figures weigh by, too
+        command = robot.command
+        scene.set_beta(0, -1.5)
+        assert robot.command is command  # it is still driven as bold as it may be
         scene.set_detours(False)
+        assert (robot.detour, robot.driver.helped, robot.driver.beta(-1.5)) == (None, None, -1.5)
+        assert robot_words(robot_view(robot, robot.arena.scene(), None))["limited"] == ""
         scene.step()
         assert (robot.detour, robot.driver.helped) == (None, None)
         assert robot_view(robot, robot.arena.scene(), None).detour.shape == (0, 2)
         assert not scene.choice.detours
+
+
+@pytest.mark.parametrize(("name", "beta"), [("rcwr-narrow", "1"), ("rcdsac_pow-narrow", "0"), ("sac-narrow", "")])
+def test_nobody_says_that_beta_turned_where_it_did_not(name: str, beta: str) -> None:
+    query = {"agent": name, "detours": "on"} | ({"beta": beta} if beta else {})
+    with driven(0, **query) as scene:
+        (robot,) = held(scene).robots
+        for _ in range(50):
+            scene.step()
+        driver = robot.driver
+        assert isinstance(driver, AgentDriver)
+        assert driver.policy.advice is not None
+        assert driver.policy.advice.boldness == 1.0
+        assert driver.helped is None
 
 
 def test_contacts_are_counted_when_they_begin_and_shown_where() -> None:

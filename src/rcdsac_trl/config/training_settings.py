@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rcdsac_trl.agent.loss.batch_threads import useful_threads
 from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings
@@ -193,6 +194,13 @@ class TrainingSettings:
                 f"replay.capacity_steps={self.replay.capacity_steps} does not hold the {iteration_steps} steps of one "
                 "iteration (world.num_agents x task.episode_steps): raise it"
             )
+
+    @property
+    def update_threads(self) -> int:
+        """How many threads share an update on a CPU: those of ``threads`` that find work in it."""
+        steps = self.learner.sequence_length - self.learner.burn_in
+        threads = runtime.resolve_threads(self.threads)
+        return useful_threads(self.learner.batch_size, steps, self.learner.num_critics, threads)
 
     @property
     def training_world(self) -> WorldSettings:

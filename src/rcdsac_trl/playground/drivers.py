@@ -1,7 +1,7 @@
 """Who drives a robot on the page: a trained agent, or a classical planner with the same inputs."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.deploy import Command, Guard, Policy, Sectors, Weights
 from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
+from rcdsac_trl.deploy.policy.context import bolder
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller
@@ -121,6 +122,23 @@ class Driver(Protocol):
         ...
 
 
+class _SeeingNavigator(Navigator):
+    """What navigates around an agent and sees what that sees, as in an evaluation; the stop zone sees all around.
+
+    Args:
+        robot: that the agent drives.
+        sensor: that it sees with.
+    """
+
+    def __init__(self, robot: RobotSettings, sensor: str) -> None:
+        self._mask = robot.sensor_mask(sensor)
+        super().__init__(NavigatorSettings(), robot)
+
+    def advise(self, distances_m: NDArray[np.float64], covered: NDArray[np.bool_], *rest: Any) -> Advice:
+        """See :meth:`Navigator.advise`."""
+        return super().advise(distances_m, covered & self._mask, *rest)
+
+
 class AgentDriver:
     """A trained agent.
 
@@ -141,6 +159,7 @@ class AgentDriver:
         self.robot, self.sensor, self.memory_s = config.robot, config.sensor, config.memory_s
         self.detour: tuple[float, float] | None = None
         self.helped: str | None = None
+        self._turned_to: float | None = None  # where the watchdog has turned beta; None: it has not
         self.fixed_beta = config.fixed_beta
         self.measure = make_measure(config.measure) if config.critic == "quantile" else None
         self.dial: Dial | None = None
@@ -168,13 +187,13 @@ class AgentDriver:
     def set_detours(self, on: bool) -> None:
         """Put detours and a watchdog around the agent, as on a robot, or take them away."""
         if on != (self.policy.navigator is not None):
-            self.policy.navigator = Navigator(NavigatorSettings(), self.robot) if on else None
-            self.detour = self.helped = None
+            self.policy.navigator = _SeeingNavigator(self.robot, self.sensor) if on else None
+            self.detour = self.helped = self._turned_to = None
 
     def beta(self, dialled: float | None) -> float | None:
-        """Return the beta by which the measure weighs the return: as dialled, or the one of the training."""
+        """Return the beta by which it acts: as dialled or turned by the watchdog, or the one of the training."""
         if self.policy.config.context == "beta":
-            return dialled
+            return dialled if self._turned_to is None else self._turned_to
         if self.fixed_beta is not None or self.measure is None:
             return self.fixed_beta
         return self.measure.neutral_beta
@@ -189,24 +208,27 @@ class AgentDriver:
         beta, weight = (None, dialled) if is_weight else (dialled, None)
         sectors, waypoints, velocity = situation.sectors, situation.waypoints, situation.velocity
         command = self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight)
-        self._note(self.policy.advice, (float(waypoints[0, 0]), float(waypoints[0, 1])))
+        advice = None if command.stopped else self.policy.advice
+        self._note(advice, (float(waypoints[0, 0]), float(waypoints[0, 1])), dialled)
         return command
 
-    def _note(self, advice: Advice | None, waypoint: tuple[float, float]) -> None:
-        """Keep what was made of a waypoint that the agent was sent to."""
-        self.detour = self.helped = None
+    def _note(self, advice: Advice | None, waypoint: tuple[float, float], dialled: float | None) -> None:
+        """Keep what was made of a waypoint that the agent was sent to, and of what is dialled."""
+        self.detour = self.helped = self._turned_to = None
         if advice is None:
             return
         if advice.waypoints[0] != waypoint:
             self.detour = advice.waypoints[0]
+        turned_to = bolder(self.policy.config, dialled, advice.boldness)
+        if turned_to != dialled:
+            self._turned_to = turned_to
+            self.helped = "it stood still: turned to bold"
         if advice.instead is not None:
             self.helped = "it stood still and backs off"
-        elif advice.boldness > 0.0 and self.policy.config.context is not None:
-            self.helped = "it stood still: turned to bold"
 
     def reconsidered(self, command: Command, dialled: float | None) -> Command:
         """Return a command with what the agent would want with another beta, and what it expects of that."""
-        if self.policy.config.context != "beta":
+        if self.policy.config.context != "beta" or self._turned_to is not None:
             return command
         outlook = self.policy.foresee(dialled)
         told = {name: getattr(outlook, name) for name in ("wanted", "quantiles", "value", "raw_quantiles")}

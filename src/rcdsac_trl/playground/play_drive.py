@@ -163,13 +163,18 @@ class Drive:
         """Put detours and a watchdog around all agents, or take them away; planners navigate by themselves."""
         for robot in self.robots:
             robot.driver.set_detours(on)
-            if not on:
-                robot.detour = None
+        self._forget_detours()
         self.choice = replace(self.choice, detours=on)
+
+    def _forget_detours(self) -> None:
+        """Show none until the next step says where it leads now."""
+        for robot in self.robots:
+            robot.detour = None
 
     def set_goal(self, x: float, y: float) -> None:
         """Send all robots to the place nearest to a point, m, that they can get to."""
         self._each(lambda arena: arena.set_goal(x, y))
+        self._forget_detours()
 
     def put_obstacle(self, x: float, y: float) -> None:
         """Put an obstacle into every world.
@@ -229,6 +234,7 @@ class Drive:
     def push(self, side: float) -> None:
         """Push all robots to their left (1.0) or to their right (-1.0)."""
         self._each(lambda arena: arena.push(side))
+        self._forget_detours()
 
     def close(self) -> None:
         """Free the physics."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
 from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.deploy import Command
 from rcdsac_trl.playground.drivers import AgentDriver, Dial
 from rcdsac_trl.playground.play_drive import Robot
 from rcdsac_trl.robot.action import desired_velocities
@@ -179,7 +180,7 @@ def robot_view(robot: Robot, scene: Scene, values: ValueView | None) -> RobotVie
         speed_m_per_s=robot.trail[-1][2],
         wanted=None if command is None or command.wanted is None else _in_degrees(*command.wanted),
         told=None if command is None else _in_degrees(command.v_m_per_s, command.omega_rad_per_s),
-        limited=None if command is None else command.reason,
+        limited=_limits(command),
         helped=robot.driver.helped,
         clearance_m=max(0.0, simulation.room_at(x, y, _FARTHEST_M) - scene.robot.circumradius_m),
         reward=robot.reward,
@@ -188,6 +189,13 @@ def robot_view(robot: Robot, scene: Scene, values: ValueView | None) -> RobotVie
         returns=return_view(robot),
         values=values,
     )
+
+
+def _limits(command: Command | None) -> str | None:
+    """Return why the wheels are not told what the driver wanted, but for the watchdog's help."""
+    if command is None or command.reason is None:
+        return None
+    return command.reason if command.stopped or command.reason.startswith("limited by ") else None
 
 
 def sensor_view(scene: Scene) -> SensorView:
@@ -250,9 +258,9 @@ def value_view(robot: Robot) -> ValueView | None:
     driver = robot.driver
     if not isinstance(driver, AgentDriver) or robot.command is None:
         return None
-    told = robot.dialled if driver.policy.config.context == "beta" else None
-    expected = driver.policy.outlooks(_actions(), told).astype(np.float64)
     beta = driver.beta(robot.dialled)
+    told = beta if driver.policy.config.context == "beta" else None
+    expected = driver.policy.outlooks(_actions(), told).astype(np.float64)
     if driver.measure is not None and beta is not None:
         expected = expected * weights_of(driver.measure, beta, expected.shape[1])
     coarse = expected.mean(axis=1).reshape(VALUES_A_SIDE, VALUES_A_SIDE)

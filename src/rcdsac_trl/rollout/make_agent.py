@@ -16,7 +16,6 @@ from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.rollout.policies import AgentNoise, LeanPolicy, OnDevice
 from rcdsac_trl.seeding import torch_seed, torch_stream
-from rcdsac_trl.system.runtime import resolve_threads
 from rcdsac_trl.world.task.spaces import ACTION_SIZE
 
 
@@ -42,7 +41,7 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
         learner,
         measure=algo.distortion.measure,
         generator=torch_stream(settings.seed, "loss", device=device),
-        threads=resolve_threads(settings.threads),
+        threads=settings.update_threads,
     ).to(device)
     loss.make_value_estimator(gamma=learner.gamma)
     return loss

@@ -32,8 +32,8 @@ def check_processes(settings: TrainingSettings) -> None:
     Raises:
         UserInputError: naming what to set.
     """
-    threads = runtime.resolve_threads(settings.threads)
-    of_validation = resolve_processes_beside(settings.validation.processes, settings.validation.num_maps, threads)
+    validation = settings.validation
+    of_validation = resolve_processes_beside(validation.processes, validation.num_maps, settings.update_threads)
     collecting = resolve_processes(settings.collector.num_processes, settings.world.num_agents)
     if of_validation or collecting or settings.training_world.num_workers:
         check_may_start_processes()

@@ -71,7 +71,7 @@ def make_trainer(
     facts = {
         "overrides": list(overrides),
         "device": runtime.resolve_device(settings.device),
-        "threads": runtime.resolve_threads(settings.threads),
+        "threads": settings.update_threads,
         "allocator": runtime.allocator(),
         "matrix_products": matmul.LIBRARY,
     }
@@ -154,7 +154,7 @@ def _assemble(
     on_iteration_end: IterationHook | None,
 ) -> Trainer:
     """Put the run together; it goes on from what is saved, or begins with a progress of no iterations."""
-    device, threads = runtime.resolve_device(settings.device), runtime.resolve_threads(settings.threads)
+    device, threads = runtime.resolve_device(settings.device), settings.update_threads
     checkpoints = _checkpoints(settings, learner, folder)
     shortage = _disk_shortage(settings, learner, checkpoints)
     if isinstance(begin, Saved):

@@ -30,7 +30,7 @@ def forward(module: nn.Module, *inputs: Tensor | None) -> Any:
     No gradient flows to the inputs of an encoder: they are data.
     """
     if _is_ours(inputs):
-        if _is_plain_encoder(module) and _many(inputs[0]):
+        if is_plain_encoder(module) and _many(inputs[0]):
             return _encode(module, *inputs)
         if _is_plain_quantile_head(module):
             return _evaluate(module, *inputs)
@@ -39,7 +39,7 @@ def forward(module: nn.Module, *inputs: Tensor | None) -> Any:
 
 def step(encoder: HistoryEncoder, range_: Tensor, *rest: Tensor) -> tuple[Tensor, Tensor]:
     """Return ``encoder.step(range_, *rest)``, its features by their compiled twin where there is one."""
-    if not (_is_ours((range_, *rest)) and _is_plain_encoder(encoder) and _many(range_)):
+    if not (_is_ours((range_, *rest)) and is_plain_encoder(encoder) and _many(range_)):
         return encoder.step(range_, *rest)
     assert isinstance(encoder, Encoder)
     *vectors, is_init, state = rest
@@ -54,14 +54,14 @@ def one_by_one(encoder: HistoryEncoder) -> Callable[..., tuple[Tensor, Tensor]]:
 
     The compiled twin computes an agent's numbers from its own row alone; the layers of others need not.
     """
-    return CompiledEncoder(encoder).step if _is_plain_encoder(encoder) else encoder.step  # type: ignore[arg-type]
+    return CompiledEncoder(encoder).step if is_plain_encoder(encoder) else encoder.step  # type: ignore[arg-type]
 
 
 def has_compiled_actor(encoder: nn.Module, head: nn.Module) -> bool:
     """Return whether :class:`~rcdsac_trl.agent.kernels.compiled_actor.CompiledActor` knows both."""
     layers = "input", "hidden", "output"
     return (
-        _is_plain_encoder(encoder)
+        is_plain_encoder(encoder)
         and type(head) is ActorHead
         and (head.measure is None or (type(head.cosines) is CosineFeatures and _is_linear(head.gate)))
         and all(_is_linear(getattr(head, name)) for name in layers)
@@ -90,7 +90,8 @@ def _is_linear(layer: nn.Module) -> bool:
     return type(layer) is nn.Linear and layer.bias is not None
 
 
-def _is_plain_encoder(module: nn.Module) -> bool:
+def is_plain_encoder(module: nn.Module) -> bool:
+    """Return whether an encoder is the package's own, with the layers that it is made with."""
     if type(module) is not Encoder or type(module.range) is not RangeFeatures or type(module.gru) is not nn.GRU:
         return False
     gru, layers = module.gru, module.range

@@ -6,7 +6,7 @@ Here each thread does the whole work of some sequences, forwards and backwards, 
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 from typing import Any
@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+Gradients = tuple[Tensor | None, ...]
 
 # A smaller part is mostly calls of operations, and Python makes one at a time.
 _TRANSITIONS_PER_PART = 1024
@@ -36,6 +38,39 @@ def split_batch(sequences: int, steps: int, threads: int) -> list[slice]:
     return [slice(start, stop) for start, stop in pairwise(edges)]
 
 
+def useful_threads(sequences: int, steps: int, critics: int, threads: int) -> int:
+    """Return how many of some threads find work in a batch: all where it is cut, else about one a network.
+
+    Args:
+        sequences: of the batch.
+        steps: of a sequence.
+        critics: their number.
+        threads: that there are.
+
+    Example:
+        >>> useful_threads(100, 64, critics=2, threads=16), useful_threads(32, 8, critics=2, threads=16)
+        (16, 3)
+    """
+    return threads if len(split_batch(sequences, steps, threads)) > 1 else min(threads, 1 + critics)
+
+
+def gradients_of(
+    outputs: Sequence[Tensor], parameters: Sequence[nn.Parameter], slopes: Sequence[Tensor] | None = None
+) -> Gradients:
+    """Return gradients as a backward pass leaves them: None for what is frozen or has no part in it.
+
+    Args:
+        outputs: are differentiated.
+        parameters: by which.
+        slopes: that come back to each output; None: 1 to scalars.
+    """
+    wanted = [parameter for parameter in parameters if parameter.requires_grad]
+    if not wanted or not all(output.requires_grad for output in outputs):
+        return (None,) * len(parameters)
+    found = iter(torch.autograd.grad(outputs, wanted, slopes, allow_unused=True))
+    return tuple(next(found) if parameter.requires_grad else None for parameter in parameters)
+
+
 def parallel_backward(
     compute: Callable[[slice], dict[str, Tensor]],
     groups: dict[str, list[nn.Parameter]],
@@ -54,10 +89,10 @@ def parallel_backward(
     """
     parameters = [parameter for group in groups.values() for parameter in group]
 
-    def work(part: slice) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
+    def work(part: slice) -> tuple[dict[str, Tensor], Gradients]:
         values = compute(part)
         losses = torch.stack([values[name] for name in groups])
-        gradients = torch.autograd.grad(losses.sum(), parameters, materialize_grads=True)
+        gradients = gradients_of([losses.sum()], parameters)
         return {name: value.detach() for name, value in values.items()}, gradients
 
     pool = thread_pool(len(parts), max(1, threads // len(parts)))
@@ -66,19 +101,20 @@ def parallel_backward(
     (values, gradients), *others = (future.result() for future in running)
     for more_values, more_gradients in others:
         values = {name: value + more_values[name] for name, value in values.items()}
-        gradients = torch._foreach_add(gradients, more_gradients)
+        pairs = zip(gradients, more_gradients, strict=True)
+        gradients = tuple(a if b is None else b if a is None else a + b for a, b in pairs)
     return values | with_gradients({name: values[name] for name in groups}, groups, gradients)
 
 
 def with_gradients(
-    losses: dict[str, Tensor], groups: dict[str, list[nn.Parameter]], gradients: tuple[Tensor, ...]
+    losses: dict[str, Tensor], groups: dict[str, list[nn.Parameter]], gradients: Gradients
 ) -> dict[str, Tensor]:
     """Return losses whose backward pass gives gradients that are known already.
 
     Args:
         losses: scalars.
         groups: name of each loss, and all the parameters it has a gradient in.
-        gradients: of all groups' parameters, one group's behind the other's.
+        gradients: of all groups' parameters, one group's behind the other's; None for none.
     """
     parameters = [parameter for group in groups.values() for parameter in group]
     known = _Known.apply([losses[name] for name in groups], list(map(len, groups.values())), gradients, *parameters)
@@ -104,13 +140,15 @@ class _Known(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, losses: list[Tensor], sizes: list[int], gradients: tuple[Tensor, ...], *_: nn.Parameter
+        ctx: Any, losses: list[Tensor], sizes: list[int], gradients: Gradients, *_: nn.Parameter
     ) -> tuple[Tensor, ...]:
         ctx.sizes, ctx.gradients = sizes, gradients
+        ctx.set_materialize_grads(False)  # a loss that nobody differentiates leaves no gradients
         return tuple(losses)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
         each = (slope for slope, size in zip(slopes, ctx.sizes, strict=True) for _ in range(size))
-        return None, None, None, *(gradient * slope for gradient, slope in zip(ctx.gradients, each, strict=True))
+        pairs = zip(ctx.gradients, each, strict=True)
+        return None, None, None, *(None if a is None or slope is None else a * slope for a, slope in pairs)

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from torchrl.objectives.utils import _reduce
 from torchrl.objectives.value.functional import td0_return_estimate
 
+from rcdsac_trl.agent.kernels import dispatch
 from rcdsac_trl.agent.loss.batch_threads import parallel_backward, split_batch
 from rcdsac_trl.agent.loss.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
 from rcdsac_trl.agent.loss.linked_loss import LinkedLoss
@@ -135,7 +136,8 @@ class DistributionalSACLoss(LinkedLoss):
             parts = split_batch(sequences, steps, self.threads)
             if len(parts) > 1:
                 return TensorDict(self._reduced_in_parts(tensordict, samples, parts))
-            if type(self) is DistributionalSACLoss:  # of another one's losses the tasks know nothing
+            # Of another one's losses the tasks know nothing; networks of others may draw random numbers in turn.
+            if type(self) is DistributionalSACLoss and self._has_own_networks():
                 return TensorDict(backward_in_tasks(self, tensordict, samples))
         return TensorDict(self._reduced(tensordict, samples))
 
@@ -289,6 +291,15 @@ class DistributionalSACLoss(LinkedLoss):
         return -self.log_alpha * (log_prob.detach() + self.settings.target_entropy)
 
     # ------------------------------------------------------------------------------------------- parts of them
+    def _has_own_networks(self) -> bool:
+        """Return whether all networks are of this package, layers included."""
+        (actor_encoder, actor_head), *critics = (
+            [getattr(part, "module", part) for part in network] for network in (self.actor_network, *self.critics)
+        )
+        return dispatch.has_compiled_actor(actor_encoder, actor_head) and all(
+            dispatch.is_plain_encoder(encoder) and dispatch.has_compiled_values(head) for encoder, head in critics
+        )
+
     def _encode(self, network: TensorDictSequential, tensordict: TensorDictBase, stop: int | None = None) -> Tensor:
         encoder = network[0]
         (memory,) = call_module(encoder, {key: tensordict.get(key)[:, :stop] for key in encoder.in_keys})

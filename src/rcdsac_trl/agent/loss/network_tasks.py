@@ -4,7 +4,7 @@ A mini-batch as small as the laptop's gains nothing from being cut (:mod:`rcdsac
 part calls every operation. But most of what its networks do does not wait for one another.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, wait
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.objectives.utils import _reduce
 
-from rcdsac_trl.agent.loss.batch_threads import thread_pool, with_gradients
+from rcdsac_trl.agent.loss.batch_threads import Gradients, gradients_of, thread_pool, useful_threads, with_gradients
 from rcdsac_trl.agent.loss.samples import LossSamples
 
 if TYPE_CHECKING:
@@ -26,9 +26,12 @@ def backward_in_tasks(
 ) -> dict[str, Tensor]:
     """Return the reduced losses, with gradients that are computed already, and the diagnostics' means.
 
-    All are to the last bit what the methods of the loss give one after the other on one thread.
+    All are to the last bit what the methods of the loss give one after the other on one thread, gradients where the
+    losses are weighed by powers of two, as their sum does: others are rounded behind the sums here.
     """
-    tasks = _Tasks(min(loss.threads, 1 + len(loss.critics)))
+    sequences, steps = samples.noise.shape[:2]
+    tasks = _Tasks(useful_threads(sequences, steps, len(loss.critics), loss.threads))
+    _ = loss.target_critic_network_params  # TorchRL warns here where nothing updates them
     # The actor's gradient takes longest, and is begun first.
     actor_memory = tasks.add(loss.encode_actor, tensordict)
     memories = [tasks.add(loss.encode_critic, critic, tensordict) for critic in loss.critics]
@@ -60,7 +63,7 @@ def backward_in_tasks(
         "loss_qvalue": _reduce(torch.stack(errors).sum(0), loss.reduction),
         "loss_alpha": loss_alpha.detach(),
     }
-    gradients = (*actor_gradients, *sum(critic_gradients, ()), *torch.autograd.grad(loss_alpha, [loss.log_alpha]))
+    gradients = (*actor_gradients, *sum(critic_gradients, ()), *gradients_of([loss_alpha], [loss.log_alpha]))
     diagnostics = loss.diagnose([value.result() for value in values], target.result())
     diagnostics |= {"alpha": loss.alpha, "entropy": -log_prob}
     means = {key: value.mean() for key, value in diagnostics.items()}
@@ -109,7 +112,7 @@ def _judge(
 
 def _differentiate_actor(
     loss: "DistributionalSACLoss", policy: tuple[Tensor, Tensor], *judged: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Sequence[Tensor]]:
+) -> tuple[Tensor, Gradients]:
     """Return the actor loss, reduced and detached, and its gradients.
 
     Autograd adds up what reaches the action from several critics in the order in which their operations were called,
@@ -124,7 +127,7 @@ def _differentiate_actor(
     for (value, leaf), value_slope in reversed(list(zip(judged, slopes, strict=True))):
         (of_one,) = torch.autograd.grad(value, leaf, value_slope)
         through_action = through_action + of_one
-    gradients = torch.autograd.grad([action, log_prob], loss.trained["loss_actor"], [through_action, slope])
+    gradients = gradients_of([action, log_prob], loss.trained["loss_actor"], [through_action, slope])
     return reduced.detach(), gradients
 
 
@@ -146,8 +149,7 @@ def _target(
 
 def _differentiate_critic(
     loss: "DistributionalSACLoss", critic: TensorDictSequential, value: Tensor, target: Tensor, samples: LossSamples
-) -> tuple[Tensor, tuple[Tensor, ...]]:
+) -> tuple[Tensor, Gradients]:
     """Return a critic's share of the critic loss ``[B, L - burn_in]``, detached, and the gradients of its weights."""
     error = loss.critic_error(value, target, samples)
-    gradients = torch.autograd.grad(_reduce(error, loss.reduction), list(critic.parameters()))
-    return error.detach(), gradients
+    return error.detach(), gradients_of([_reduce(error, loss.reduction)], list(critic.parameters()))
