@@ -78,7 +78,7 @@ class Controls:
         self._hear(speed, "active", visitor.choose_speed)
         self._stop = self._made(Toggle, "stop", label="stop zone", active=False)
         self._hear(self._stop, "active", visitor.switch_stop_zone)
-        self._detours = self._made(Toggle, "detours", label="detours + watchdog", active=False)
+        self._detours = self._made(Toggle, "detours", label="detours", active=False)
         self._hear(self._detours, "active", visitor.switch_detours)
         self._zoom = self._made(Toggle, "follow", label="zoom in", active=zoomed)
         self._hear(self._zoom, "active", lambda on: zoom())
