@@ -18,7 +18,7 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 4 --dist loadfile
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F '|' '{ printf "%-16s %s\n", $$1, $$2 }'
 
-train: install ## train a risk-conditioned agent: two cores, about 40 minutes
+train: install ## train a risk-conditioned agent: two cores, about 25 minutes
 	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
 
 smoke: install ## rehearse the whole training in a minute or two; it learns nothing

@@ -44,7 +44,7 @@ VERBS = {
     "train": Verb(
         does="train an agent into a new run folder, or continue a run",
         examples={
-            "+algo=rcdsac_pow": "RC-DSAC with the power law: about 40 minutes on two cores",
+            "+algo=rcdsac_pow": "RC-DSAC with the power law: about 25 minutes on two cores",
             "+algo=rcdsac_cvar sensor=sparse map=hard seed=1": "another measure, sensor, map set and seed",
             "resume=runs/<folder>": "go on where a run ended early",
         },
