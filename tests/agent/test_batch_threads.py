@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from test_loss import LOSSES, make_batch, make_loss
 from torch import Tensor
 
-from rcdsac_trl.agent.loss import batch_threads
+from rcdsac_trl.agent.loss import batch_parts
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 
 SEQUENCES, STEPS = 7, 4
@@ -17,7 +17,7 @@ SEQUENCES, STEPS = 7, 4
 @pytest.fixture(autouse=True)
 def _small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
-    monkeypatch.setattr(batch_threads, "_TRANSITIONS_PER_PART", STEPS)
+    monkeypatch.setattr(batch_parts, "_TRANSITIONS_PER_PART", STEPS)
 
 
 def make_threaded(kind: str = "rcdsac", **settings: Any) -> DistributionalSACLoss:
@@ -36,7 +36,7 @@ def losses_and_gradients(loss: DistributionalSACLoss, batch: TensorDict) -> tupl
 
 
 def in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_threads, "_TRANSITIONS_PER_PART", SEQUENCES * STEPS)
+    monkeypatch.setattr(batch_parts, "_TRANSITIONS_PER_PART", SEQUENCES * STEPS)
 
 
 @pytest.mark.parametrize("settings", [{}, {"fractions_per": "transition", "burn_in": 1}, {"reduction": "sum"}])
@@ -92,8 +92,8 @@ def test_what_fails_in_a_part_fails_in_the_call() -> None:
 
 
 def test_parts_are_even_and_not_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert batch_threads.split_batch(SEQUENCES, STEPS, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
-    assert batch_threads.split_batch(2, 100, 3) == [slice(0, 1), slice(1, 2)]
+    assert batch_parts.split_batch(SEQUENCES, STEPS, 3) == [slice(0, 2), slice(2, 4), slice(4, 7)]
+    assert batch_parts.split_batch(2, 100, 3) == [slice(0, 1), slice(1, 2)]
     in_one_piece(monkeypatch)
-    assert batch_threads.split_batch(SEQUENCES, STEPS, 3) == [slice(0, SEQUENCES)]
-    assert batch_threads.split_batch(2 * SEQUENCES, STEPS, 3) == [slice(0, SEQUENCES), slice(SEQUENCES, 2 * SEQUENCES)]
+    assert batch_parts.split_batch(SEQUENCES, STEPS, 3) == [slice(0, SEQUENCES)]
+    assert batch_parts.split_batch(2 * SEQUENCES, STEPS, 3) == [slice(0, SEQUENCES), slice(SEQUENCES, 2 * SEQUENCES)]

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rcdsac_trl.agent.loss.batch_threads import useful_threads
+from rcdsac_trl.agent.loss.batch_parts import useful_threads
 from rcdsac_trl.agent.network_settings import NetworkSettings
 from rcdsac_trl.config.algo_settings import AlgoSettings
 from rcdsac_trl.config.collector_settings import SINGLE, CollectorSettings

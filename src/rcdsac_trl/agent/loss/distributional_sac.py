@@ -13,7 +13,8 @@ from torchrl.objectives.utils import _reduce
 from torchrl.objectives.value.functional import td0_return_estimate
 
 from rcdsac_trl.agent.kernels import dispatch
-from rcdsac_trl.agent.loss.batch_threads import parallel_backward, split_batch
+from rcdsac_trl.agent.loss.batch_parts import split_batch
+from rcdsac_trl.agent.loss.batch_threads import parallel_backward
 from rcdsac_trl.agent.loss.functional import call_module, mean, minimum, quantile_huber_loss, smaller, squash
 from rcdsac_trl.agent.loss.linked_loss import LinkedLoss
 from rcdsac_trl.agent.loss.loss_settings import LossSettings

@@ -14,7 +14,8 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.objectives.utils import _reduce
 
-from rcdsac_trl.agent.loss.batch_threads import Gradients, gradients_of, thread_pool, useful_threads, with_gradients
+from rcdsac_trl.agent.loss.batch_parts import useful_threads
+from rcdsac_trl.agent.loss.batch_threads import Gradients, gradients_of, thread_pool, with_gradients
 from rcdsac_trl.agent.loss.samples import LossSamples
 
 if TYPE_CHECKING:
