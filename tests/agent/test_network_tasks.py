@@ -67,7 +67,7 @@ def test_they_give_to_the_last_bit_what_one_thread_gives(
         assert all(map(torch.equal, gradients, expected_gradients))
 
 
-def test_frozen_and_unused_weights_are_left_alone() -> None:
+def test_frozen_weights_are_left_alone() -> None:
     loss, batch = make_loss(), make_batch(7, 5)
     frozen = [*loss.critics[0][0].parameters(), next(loss.actor_network[1].parameters())]
     for parameter in frozen:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
 from rcdsac_trl.deploy import Command, Guard, Policy, Sectors, Weights
 from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
-from rcdsac_trl.deploy.policy.context import bolder
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller
@@ -157,9 +156,7 @@ class AgentDriver:
         config = weights.config
         self.policy = Policy(weights, guard=None, num_quantiles=NUM_QUANTILES)
         self.robot, self.sensor, self.memory_s = config.robot, config.sensor, config.memory_s
-        self.detour: tuple[float, float] | None = None
-        self.helped: str | None = None
-        self._turned_to: float | None = None  # where the watchdog has turned beta; None: it has not
+        self._forget_help()
         self.fixed_beta = config.fixed_beta
         self.measure = make_measure(config.measure) if config.critic == "quantile" else None
         self.dial: Dial | None = None
@@ -188,7 +185,7 @@ class AgentDriver:
         """Put detours and a watchdog around the agent, as on a robot, or take them away."""
         if on != (self.policy.navigator is not None):
             self.policy.navigator = _SeeingNavigator(self.robot, self.sensor) if on else None
-            self.detour = self.helped = self._turned_to = None
+            self._forget_help()
 
     def beta(self, dialled: float | None) -> float | None:
         """Return the beta by which it acts: as dialled or turned by the watchdog, or the one of the training."""
@@ -208,20 +205,23 @@ class AgentDriver:
         beta, weight = (None, dialled) if is_weight else (dialled, None)
         sectors, waypoints, velocity = situation.sectors, situation.waypoints, situation.velocity
         command = self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight)
-        advice = None if command.stopped else self.policy.advice
-        self._note(advice, (float(waypoints[0, 0]), float(waypoints[0, 1])), dialled)
+        self._forget_help()
+        if not command.stopped and self.policy.advice is not None:
+            self._note(self.policy.advice, (float(waypoints[0, 0]), float(waypoints[0, 1])))
         return command
 
-    def _note(self, advice: Advice | None, waypoint: tuple[float, float], dialled: float | None) -> None:
-        """Keep what was made of a waypoint that the agent was sent to, and of what is dialled."""
-        self.detour = self.helped = self._turned_to = None
-        if advice is None:
-            return
+    def _forget_help(self) -> None:
+        """Forget what the navigator did last."""
+        self.detour: tuple[float, float] | None = None
+        self.helped: str | None = None
+        self._turned_to: float | None = None  # where the watchdog has turned beta; None: it has not
+
+    def _note(self, advice: Advice, waypoint: tuple[float, float]) -> None:
+        """Keep what was made of a waypoint that the agent was sent to, and of what was dialled."""
         if advice.waypoints[0] != waypoint:
             self.detour = advice.waypoints[0]
-        turned_to = bolder(self.policy.config, dialled, advice.boldness)
-        if turned_to != dialled:
-            self._turned_to = turned_to
+        self._turned_to = self.policy.turned_to
+        if self._turned_to is not None:
             self.helped = "it stood still: turned to bold"
         if advice.instead is not None:
             self.helped = "it stood still and backs off"

@@ -77,10 +77,8 @@ def _dial_words(robot: RobotView) -> dict[str, Any]:
 
 def _help_words(robot: RobotView) -> list[str]:
     """Return what stands between who drives and the wheels now."""
-    words = []
-    if robot.limited is not None:
-        words.append(f"held by {robot.limited.removeprefix('limited by ').split(';')[0]}")
-    return words if robot.helped is None else [*words, robot.helped]
+    held = [] if robot.limited is None else [f"held by {robot.limited}"]
+    return held if robot.helped is None else [*held, robot.helped]
 
 
 def robot_words(robot: RobotView) -> dict[str, Any]:

@@ -26,6 +26,8 @@ FINE = 6
 """Between two of them the picture has so many pixels; they are interpolated."""
 
 _FARTHEST_M = 3.0
+# So a command begins to say that the stop zone limits it; behind a semicolon stands how that ends.
+_LIMITED_BY = "limited by "
 _ARROW = np.array([[0.17, 0.0], [-0.10, 0.11], [-0.05, 0.0], [-0.10, -0.11]])
 
 
@@ -106,7 +108,7 @@ class RobotView:
         speed_m_per_s: linear velocity.
         wanted: speed in m/s and turning rate in degrees/s that the driver wanted; None before the first step.
         told: those that the wheels were told, with the stop zone between.
-        limited: why they differ; None if they do not.
+        limited: the cause why they differ; None if they do not, or the watchdog helps.
         helped: how the watchdog helps it; None if it does not.
         clearance_m: between the robot's circle and the nearest thing, seen or not.
         reward: so far; None where nothing is paid.
@@ -192,10 +194,10 @@ def robot_view(robot: Robot, scene: Scene, values: ValueView | None) -> RobotVie
 
 
 def _limits(command: Command | None) -> str | None:
-    """Return why the wheels are not told what the driver wanted, but for the watchdog's help."""
-    if command is None or command.reason is None:
+    """Return the cause why the wheels are not told what the driver wanted, but for the watchdog's help."""
+    if command is None or command.reason is None or not (command.stopped or command.reason.startswith(_LIMITED_BY)):
         return None
-    return command.reason if command.stopped or command.reason.startswith("limited by ") else None
+    return command.reason.removeprefix(_LIMITED_BY).split(";")[0]
 
 
 def sensor_view(scene: Scene) -> SensorView:

@@ -151,8 +151,11 @@ class DistributionalSACLoss(LinkedLoss):
         return losses, diagnostics | {"alpha": self.alpha, "entropy": -log_prob}
 
     def _reduced(self, tensordict: TensorDictBase, samples: LossSamples) -> dict[str, Tensor]:
-        """Return the reduced losses and the diagnostics' means."""
-        losses, diagnostics = self._losses(tensordict, samples)
+        """Return the reduced losses and the diagnostics' means of a batch."""
+        return self.reduce_all(*self._losses(tensordict, samples))
+
+    def reduce_all(self, losses: dict[str, Tensor], diagnostics: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the reduced losses and the diagnostics' means, of entries ``[B, L - burn_in]``."""
         reduced = {key: _reduce(value, self.reduction) for key, value in losses.items()}
         return reduced | {key: value.mean() for key, value in diagnostics.items()}
 

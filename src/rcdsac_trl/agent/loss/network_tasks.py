@@ -58,17 +58,16 @@ def backward_in_tasks(
     loss_actor, actor_gradients = actor.result()
     errors, critic_gradients = zip(*(critic.result() for critic in critics), strict=True)
     log_prob = policy.result()[1].detach()
-    loss_alpha = _reduce(loss.alpha_objective(log_prob), loss.reduction)
     losses = {
         "loss_actor": loss_actor,
-        "loss_qvalue": _reduce(torch.stack(errors).sum(0), loss.reduction),
-        "loss_alpha": loss_alpha.detach(),
+        "loss_qvalue": torch.stack(errors).sum(0),
+        "loss_alpha": loss.alpha_objective(log_prob),
     }
-    gradients = (*actor_gradients, *sum(critic_gradients, ()), *gradients_of([loss_alpha], [loss.log_alpha]))
     diagnostics = loss.diagnose([value.result() for value in values], target.result())
-    diagnostics |= {"alpha": loss.alpha, "entropy": -log_prob}
-    means = {key: value.mean() for key, value in diagnostics.items()}
-    return with_gradients(losses, loss.trained, gradients) | means
+    reduced = loss.reduce_all(losses, diagnostics | {"alpha": loss.alpha, "entropy": -log_prob})
+    alpha_gradients = gradients_of([reduced["loss_alpha"]], [loss.log_alpha])
+    gradients = (*actor_gradients, *sum(critic_gradients, ()), *alpha_gradients)
+    return reduced | with_gradients({name: reduced[name].detach() for name in losses}, loss.trained, gradients)
 
 
 class _Tasks:
@@ -114,7 +113,7 @@ def _judge(
 def _differentiate_actor(
     loss: "DistributionalSACLoss", policy: tuple[Tensor, Tensor], *judged: tuple[Tensor, Tensor]
 ) -> tuple[Tensor, Gradients]:
-    """Return the actor loss, reduced and detached, and its gradients.
+    """Return the actor loss ``[B, L - burn_in]``, detached, and its gradients.
 
     Autograd adds up what reaches the action from several critics in the order in which their operations were called,
     and knows none across threads: here it is the order of one thread, from the last critic to the first.
@@ -122,14 +121,14 @@ def _differentiate_actor(
     action, log_prob = policy
     density = log_prob.detach().requires_grad_()
     values = [value.detach().requires_grad_() for value, _ in judged]
-    reduced = _reduce(loss.actor_objective(values, density), loss.reduction)
-    slope, *slopes = torch.autograd.grad(reduced, [density, *values])
+    entries = loss.actor_objective(values, density)
+    slope, *slopes = torch.autograd.grad(_reduce(entries, loss.reduction), [density, *values])
     through_action = torch.zeros_like(action)
     for (value, leaf), value_slope in reversed(list(zip(judged, slopes, strict=True))):
         (of_one,) = torch.autograd.grad(value, leaf, value_slope)
         through_action = through_action + of_one
     gradients = gradients_of([action, log_prob], loss.trained["loss_actor"], [through_action, slope])
-    return reduced.detach(), gradients
+    return entries.detach(), gradients
 
 
 def _next_value(

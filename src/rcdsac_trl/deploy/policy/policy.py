@@ -114,6 +114,7 @@ class Policy:
         self._periods = ControlPeriods(self.config.period_s)
         self._halted = False
         self._advice: Advice | None
+        self._turned_to: float | None
         self.reset()
 
     def reset(self) -> None:
@@ -155,6 +156,11 @@ class Policy:
     def advice(self) -> "Advice | None":
         """What the navigator made of what was seen last; None without one, or where nothing was seen."""
         return self._advice
+
+    @property
+    def turned_to(self) -> float | None:
+        """The beta that :attr:`advice` made of the one that was asked for; None where that stayed."""
+        return self._turned_to
 
     @property
     def latency_s(self) -> float:
@@ -372,14 +378,14 @@ class Policy:
         fresh = self._periods.is_due(stamps)
         self._periods.accept(stamps, fresh)
         if fresh:
-            self._advice, self._turned = None, False
+            self._advice, self._turned_to = None, None
             if self.navigator is not None:
                 self._advice = self.navigator.advise(
                     sectors.distances_m, sectors.covered, next_two, measured, elapsed_s, on_map
                 )
                 next_two, asked = self._advice.waypoints, context
                 context = bolder(self.config, asked, self._advice.boldness)
-                self._turned = context != asked
+                self._turned_to = context if context != asked else None
             seen = self._observer.observe(sectors, next_two, measured, elapsed_s, self._periods.time_s)
             self._see(*seen, context)
         return self._command(sectors, measured, fresh, fresh and forgot, on_map)
@@ -402,7 +408,7 @@ class Policy:
         outlook = self._told
         assert outlook is not None
         (v, omega), been = outlook.wanted, None
-        told = ["it stands still, so beta turns to its boldest until it gets on"] if self._turned else []
+        told = ["it stands still, so beta turns to its boldest until it gets on"] if self._turned_to is not None else []
         if self._advice is not None:
             been = self._advice.been
             if self._advice.instead is not None:
@@ -443,6 +449,6 @@ class Policy:
         """Forget what was seen: where the robot has got to since, nobody has told."""
         self._networks.forget()
         self._observer.forget()
-        self._advice, self._turned = None, False
+        self._advice, self._turned_to = None, None
         if self.navigator is not None:
             self.navigator.reset()
