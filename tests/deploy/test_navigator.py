@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rcdsac_trl.deploy import Guard, Policy
-from rcdsac_trl.deploy.navigation.detour import is_clear, plan_detour
+from rcdsac_trl.deploy.navigation.detour import BESIDE_M, is_clear, plan_detour
 from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.navigation.watchdog import Watchdog, WatchdogSettings
@@ -60,6 +60,43 @@ def test_where_nothing_leads_on_there_is_no_detour() -> None:
     local_map = LocalMap(LocalMapSettings(), ALL)
     local_map.observe(seen((0.0, 0.0, 0.0), walls))
     assert plan_detour(local_map.clearances, (0.0, 0.0), (3.5, 0.0), 0.25) == []
+
+
+@pytest.mark.parametrize(
+    "things",
+    [
+        np.array([[1.9, -0.1, 1.9, 0.1], [1.9, -0.1, 2.1, -0.1], [1.9, 0.1, 2.1, 0.1], [2.1, -0.1, 2.1, 0.1]]),
+        np.array([[1.95, -3.0, 1.95, 3.0]]),  # the waypoint is 5 cm behind a wall's face, as a pose that is off has it
+    ],
+)
+def test_where_something_stands_on_a_target_the_way_ends_beside_it_on_this_side(things: np.ndarray) -> None:
+    local_map = LocalMap(LocalMapSettings(), ALL)
+    local_map.observe(seen((0.0, 0.0, 0.0), things))
+    ((*_, (x, y)),) = [plan_detour(local_map.clearances, (0.0, 0.0), (2.0, 0.0), 0.25)]
+    assert 0.2 < math.dist((x, y), (2.0, 0.0)) < BESIDE_M
+    assert x < 1.8
+    assert float(sector_distances(x, y, 0.0, things, NO_CIRCLES).min()) > 0.2
+
+
+def test_a_waypoint_on_which_something_stands_is_driven_beside_and_then_past() -> None:
+    pole = np.array([[2.0, 0.0, 0.1]])
+
+    def told(x: float, after: tuple[float, float]) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return what a robot that comes straight is told at x, in the world's frame."""
+        navigator = Navigator(AT_ONCE)
+        ranges = sector_distances(x, 0.0, 0.0, np.empty((0, 4)), pole)
+        ahead = (2.0 - x, 0.0), (after[0] - x, after[1])
+        (x1, y1), (x2, y2) = navigator.advise(ranges, ALL, ahead, (0.0, 0.0), 0.0).waypoints
+        return (x1 + x, y1), (x2 + x, y2)
+
+    first, second = told(0.0, (4.0, 0.0))
+    assert 0.3 < math.dist(first, (2.0, 0.0)) < BESIDE_M
+    assert second == pytest.approx((4.0, 0.0))
+    first, _ = told(1.5, (4.0, 0.0))
+    assert first[0] > 1.7  # it is beside it and the waypoint still the next one: on to the one after it,
+    assert abs(first[1]) > 0.25  # around what stands there
+    goal, _ = told(1.5, (2.0, 0.0))
+    assert 0.3 < math.dist(goal, (2.0, 0.0)) < BESIDE_M  # nothing comes after a goal
 
 
 def test_waypoints_stay_where_the_way_is_free_or_was_blocked_for_a_moment() -> None:

@@ -211,12 +211,16 @@ class Navigator:
         return (places[0][0], places[0][1]), (places[1][0], places[1][1])
 
     def _planned(self, target: Place, after: Place) -> list[Place]:
-        """Return the corners of a way to the next waypoint, or past it where something stands on it; [] without one."""
+        """Return the corners of a way to the next waypoint, beside it where something stands on it; [] without one.
+
+        Where there is none, or the robot is beside it and it still is the next one, they lead to the one after it.
+        """
         clearances = self._map.clearances if self._far is None else self._far
         here, radius_m = self._map.place, self._robot.circumradius_m
         corners = plan_detour(clearances, here, target, radius_m)
-        if not corners and math.dist(target, after) > _SAME_M:
-            corners = plan_detour(clearances, here, after, radius_m)
+        arrived = bool(corners) and corners[-1] != target and math.dist(corners[-1], here) < _CORNER_M
+        if (arrived or not corners) and math.dist(target, after) > _SAME_M:
+            return plan_detour(clearances, here, after, radius_m) or corners
         return corners
 
     def _look_far(self, elapsed_s: float, pose: Pose | None) -> None:
