@@ -14,9 +14,12 @@ from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import action_of
+from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.range_sensor import sensor_mask
 from rcdsac_trl.robot.robot_settings import PAPER
+from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
 from rcdsac_trl.world.sim.lidar import sector_distances
 from tiny import evaluate, untrained_run
@@ -24,6 +27,8 @@ from tiny import evaluate, untrained_run
 FULL = sensor_mask("full")
 WALL = np.array([[1.5, -0.8, 1.5, 2.2]])
 AHEAD = (3.5, 0.0), (6.0, 0.0)
+OPEN = np.full(180, np.inf)
+ZONE = "navigation.stop_zone=true"
 
 
 class Told(TensorDictModuleBase):
@@ -88,6 +93,44 @@ def test_an_agent_that_stands_is_made_bold_and_then_backs_off() -> None:
     assert inner.risks[-1] == pytest.approx([0.2] * 2)  # a new episode begins afresh
 
 
+class Ahead(Told):
+    """Drives straight ahead at full speed."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        ahead = torch.tensor([[1.0, 0.05]]).expand(tensordict.batch_size[0], -1)
+        return super().forward(tensordict).set("action", ahead)
+
+
+def test_a_stop_zone_limits_who_has_something_ahead_and_leaves_the_other_alone() -> None:
+    quiet = NavigatorSettings(replan=False, watchdog=None)
+    policy = NavigatedPolicy(Ahead(), partial(Navigator, quiet), FULL, 2, None, 0.14, PAPER, Guard(evade=False))
+    given = observation(True, v=0.6)
+    near = sector_distances(1.0, 0.0, 0.0, WALL, np.empty((0, 3)))  # 0.5 m ahead
+    given["range"][0] = torch.from_numpy(range_observation(near, FULL))
+    limited, free = policy(given)["action"].tolist()
+    seen = Sectors(near, FULL)
+    v, omega, reason = Guard(evade=False).limit(0.6, 0.0, seen, (0.6, 0.0))  # 0.05 is within the dead band
+    assert reason == "the stop zone"
+    assert limited == pytest.approx(action_of(v, omega))
+    assert v < 0.5
+    assert free == torch.tensor([1.0, 0.05]).tolist()  # to the last bit
+
+
+def test_the_stop_zone_minds_what_has_left_the_view() -> None:
+    narrow, pole = sensor_mask("narrow"), np.array([[0.38, 0.0, 0.1]])
+    quiet = NavigatorSettings(replan=False, watchdog=None)
+    policy = NavigatedPolicy(Ahead(), partial(Navigator, quiet), narrow, 2, None, 0.14, PAPER, Guard(evade=False))
+    for step in range(9):  # the first agent turns left until the pole is at 64 degrees on its right
+        ranges = sector_distances(0.0, 0.0, 0.14 * step, np.empty((0, 4)), pole)
+        given = observation(step == 0)
+        given["range"] = torch.from_numpy(np.stack([range_observation(each, narrow) for each in (ranges, OPEN)]))
+        given["velocity"][:, 1] = 1.0
+        action = policy(given)["action"]
+    assert not given["range"].any()
+    assert action[0, 0] < 0.9
+    assert action[1, 0] == 1.0
+
+
 def test_an_evaluation_with_navigation_repeats_and_says_so(tmp_path: Path) -> None:
     run, _, _ = untrained_run(tmp_path / "run", "rcdsac_cvar")
     asked = [f"run={run}", "checkpoint=last", "beta=[0.25]", "navigation.replan=true", "navigation.watchdog=true"]
@@ -96,6 +139,16 @@ def test_an_evaluation_with_navigation_repeats_and_says_so(tmp_path: Path) -> No
     assert '"watchdog": true' in (first / "evaluation.json").read_text()
     with pytest.raises(UserInputError, match="baseline=dwa navigates by itself"):
         evaluate("baseline=dwa", "navigation.watchdog=true")
+
+
+def test_a_stop_zone_stands_behind_agents_and_planners(tmp_path: Path) -> None:
+    run, _, _ = untrained_run(tmp_path / "run", "sac")
+    asked = f"run={run}", "checkpoint=last"
+    alone, kept = (evaluate(*asked, *more, f"out={tmp_path / name}") for name, more in (("a", ()), ("b", (ZONE,))))
+    speeds = [pd.read_csv(out / "episodes.csv")["mean_speed_m_per_s"].mean() for out in (alone, kept)]
+    assert speeds[0] != speeds[1]
+    assert '"stop_zone": true' in (kept / "evaluation.json").read_text()
+    assert (evaluate("baseline=dwa", ZONE, f"out={tmp_path / 'c'}") / "episodes.csv").is_file()
 
 
 def test_nothing_navigates_unless_it_is_asked_for() -> None:

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 from rcdsac_trl.config.acting_override import ActingOverride
 from rcdsac_trl.config.baseline_name import own_class
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.config.navigation_settings import NavigationSettings
+from rcdsac_trl.config.navigation_settings import EvaluationNavigationSettings
 from rcdsac_trl.config.training_settings import SensorSettings, Threads, TrainingSettings, Workers
 from rcdsac_trl.config.typed import read, section_class
 from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
@@ -117,7 +117,7 @@ class EvaluationSettings:
     collision_weight: tuple[float, ...] | None
     beta_controller: tuple[Literal["clearance", "tail_variance"], ...] | None
     controller: ControllerSettings
-    navigation: NavigationSettings
+    navigation: EvaluationNavigationSettings
     latency_s: float
     checkpoint: Name | None
     half_precision: bool
@@ -176,7 +176,8 @@ class EvaluationSettings:
         own_class(baseline)
         agents_alone = {
             "has neither beta nor collision weight: leave them out": (self.beta, self.collision_weight) != (None, None),
-            "navigates by itself: leave navigation out": self.navigation.replan or self.navigation.watchdog,
+            "navigates by itself: leave navigation.replan and navigation.watchdog out": self.navigation.replan
+            or self.navigation.watchdog,
             "does not allow for a latency: leave latency_s out": self.latency_s,
             "has no weights to be rounded: leave half_precision out": self.half_precision,
             "has no critics to choose by: leave acting out": self.acting.given,

@@ -17,6 +17,17 @@ class NavigationSettings:
 
 
 @dataclass(frozen=True)
+class EvaluationNavigationSettings(NavigationSettings):
+    """The same in ``conf/evaluate.yaml``, where agents and planners drive without a stop zone unless it is asked for.
+
+    Attributes:
+        stop_zone: keep the robot's stop zone between the agent, or planner, and the wheels.
+    """
+
+    stop_zone: bool = False
+
+
+@dataclass(frozen=True)
 class CourseNavigationSettings(NavigationSettings):
     """The same in ``conf/course.yaml``, where a robot also knows a map.
 

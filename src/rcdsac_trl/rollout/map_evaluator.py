@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import NamedTuple
 
@@ -15,11 +15,12 @@ from torch import Tensor
 from rcdsac_trl.config.baseline_name import PURSUIT
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import ControllerSettings
-from rcdsac_trl.config.navigation_settings import NavigationSettings
+from rcdsac_trl.config.navigation_settings import EvaluationNavigationSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
-from rcdsac_trl.deploy.navigation.navigator import Navigator
+from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
+from rcdsac_trl.robot.compiled_guard import CompiledGuard
 from rcdsac_trl.rollout.beta_control import AdaptivePolicy
 from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy
 from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
@@ -28,7 +29,7 @@ from rcdsac_trl.rollout.evaluation_pool import Drive, Rows
 from rcdsac_trl.rollout.foresight import ForesightedPolicy
 from rcdsac_trl.rollout.make_agent import make_actor, make_policy, unpacked_loss
 from rcdsac_trl.rollout.measurement import measure_map
-from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
+from rcdsac_trl.rollout.navigation import NavigatedPolicy
 from rcdsac_trl.rollout.navigation_metrics import navigation_metrics
 from rcdsac_trl.rollout.planners.baselines import baseline_policy
 from rcdsac_trl.rollout.planners.controller import ControllerPolicy
@@ -82,7 +83,7 @@ class EvaluationSpec:
     controller: ControllerSettings | None = None
     baseline: str = PURSUIT
     one_trip: bool = False
-    navigation: NavigationSettings = field(default_factory=NavigationSettings)
+    navigation: EvaluationNavigationSettings = field(default_factory=EvaluationNavigationSettings)
     latency_s: float = 0.0
     acting: ActingSettings = BY_MEAN
 
@@ -133,7 +134,7 @@ def map_evaluator(
     foresighted = None
     if spec.latency_s:
         policy = foresighted = _foresighted(spec, policy, len(agent_ids))
-    if spec.navigation.replan or spec.navigation.watchdog:
+    if any(asdict(spec.navigation).values()):
         policy = _navigated(spec, policy, len(agent_ids))
     if spec.controller is not None:
         policy = adaptive = _adaptive(spec, spec.controller, policy, loss)
@@ -183,12 +184,18 @@ def _choosing(spec: EvaluationSpec, policy: TensorDictModuleBase, loss: bytes | 
 
 
 def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: int) -> NavigatedPolicy:
-    """Put navigators around the agents of a policy."""
-    algo, robot = spec.trained.algo, spec.world.robot
-    boldest = algo.distortion.measure.high if algo.context_key == "risk" else None
-    period_s = sum(spec.world.task.motor_steps) / len(spec.world.task.motor_steps) * robot.motor_period_s
-    make = partial(_navigator, spec)
-    return NavigatedPolicy(policy, make, robot.sensor_mask(spec.world.sensor), num_agents, boldest, period_s, robot)
+    """Put navigators around the agents of a policy, and a stop zone behind them."""
+    asked, algo, robot = spec.navigation, spec.trained.algo, spec.world.robot
+    return NavigatedPolicy(
+        policy,
+        partial(Navigator, NavigatorSettings.switched(replan=asked.replan, watchdog=asked.watchdog), robot),
+        robot.sensor_mask(spec.world.sensor),
+        num_agents,
+        boldest=algo.distortion.measure.high if asked.watchdog and algo.context_key == "risk" else None,
+        period_s=sum(spec.world.task.motor_steps) / len(spec.world.task.motor_steps) * robot.motor_period_s,
+        robot=robot,
+        guard=CompiledGuard.of(robot) if asked.stop_zone else None,
+    )
 
 
 def _foresighted(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: int) -> ForesightedPolicy:
@@ -196,12 +203,6 @@ def _foresighted(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents:
     world = spec.world
     sensed = world.robot.sensor_mask(world.sensor)
     return ForesightedPolicy(policy, spec.latency_s, sensed, world.memory_s, num_agents, world.robot)
-
-
-def _navigator(spec: EvaluationSpec) -> Navigator:
-    navigator = navigator_of(spec.navigation, spec.world.robot)
-    assert navigator is not None  # else nobody asks for one
-    return navigator
 
 
 def _all(measures: Sequence[Measure], map_index: int, episodes: TensorDictBase) -> dict[str, Tensor]:

@@ -11,9 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 from rcdsac_trl.config.navigation_settings import NavigationSettings
 from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
 from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
-from rcdsac_trl.robot.action import action_of
+from rcdsac_trl.robot.action import action_of, desired_velocities
+from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.sectors import Sectors
 
 
 def navigator_of(
@@ -39,6 +41,7 @@ class NavigatedPolicy(TensorDictModuleBase):
         boldest: the beta towards which an agent that stands still is turned; None: agents are told none.
         period_s: of a step, s.
         robot: that is driven.
+        guard: stands between the agents and the wheels, and minds what their navigators know; None: nothing does.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class NavigatedPolicy(TensorDictModuleBase):
         boldest: float | None,
         period_s: float,
         robot: RobotSettings = PAPER,
+        guard: Guard | None = None,
     ) -> None:
         super().__init__()
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
@@ -59,11 +63,14 @@ class NavigatedPolicy(TensorDictModuleBase):
         self._boldest = boldest
         self._period_s = period_s
         self._robot = robot
+        self._guard = guard
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, acting on what the navigators say; observations stay as they were."""
         asked = tensordict.clone(recurse=False)
-        advice = self._advice(tensordict)
+        distances_m = range_distances(tensordict["range"].numpy(), self._robot.lidar.max_range_m)
+        velocities: list[tuple[float, float]] = [(v, omega) for v, omega, *_ in tensordict["velocity"].tolist()]
+        advice = self._advice(tensordict, distances_m, velocities)
         waypoints = [waypoint_observation(AT_ORIGIN, *each.waypoints) for each in advice]
         asked["waypoint"] = torch.tensor(waypoints, dtype=torch.float32, device="cpu")
         if self._boldest is not None:
@@ -72,24 +79,30 @@ class NavigatedPolicy(TensorDictModuleBase):
         asked = self.policy(asked)
         action = asked["action"].clone()
         for row, each in enumerate(advice):
-            if each.instead is not None:
-                action[row] = torch.tensor(action_of(*each.instead, self._robot), dtype=torch.float32, device="cpu")
+            driven = each.instead
+            if self._guard is not None:
+                wish = desired_velocities(action[row].tolist(), self._robot) if driven is None else driven
+                known_m = self._navigators[row].known(distances_m[row], self._sensed, None)
+                known = Sectors(known_m, self._sensed, self._robot.lidar.max_range_m)
+                v, omega, limited = self._guard.limit(*wish, known, velocities[row], each.been)
+                driven = driven if limited is None else (v, omega)
+            if driven is not None:
+                action[row] = torch.tensor(action_of(*driven, self._robot), dtype=torch.float32, device="cpu")
         for key in self.policy.out_keys:
             tensordict[key] = asked[key]
         return tensordict.set("action", action)
 
-    def _advice(self, tensordict: TensorDictBase) -> list[Advice]:
-        distances_m = range_distances(tensordict["range"].numpy(), self._robot.lidar.max_range_m)
+    def _advice(
+        self, tensordict: TensorDictBase, distances_m: NDArray[np.float64], velocities: list[tuple[float, float]]
+    ) -> list[Advice]:
         waypoints = waypoint_positions(tensordict["waypoint"].numpy()).tolist()
-        velocities = tensordict["velocity"][:, :2].tolist()
         begins = tensordict["is_init"][:, 0].tolist()
         advice = []
         for row, navigator in enumerate(self._navigators):
             if begins[row]:
                 navigator.reset()
             (x, y), (x_after, y_after) = waypoints[row]
-            v, omega = velocities[row]
             elapsed_s = 0.0 if begins[row] else self._period_s
             following = (x, y), (x_after, y_after)
-            advice.append(navigator.advise(distances_m[row], self._sensed, following, (v, omega), elapsed_s))
+            advice.append(navigator.advise(distances_m[row], self._sensed, following, velocities[row], elapsed_s))
         return advice
