@@ -61,7 +61,9 @@ def observation(begins: bool, v: float = 0.0) -> TensorDict:
 
 def navigated(settings: NavigatorSettings) -> tuple[Told, NavigatedPolicy]:
     inner = Told()
-    return inner, NavigatedPolicy(inner, partial(Navigator, settings), FULL, 2, 1.0, 0.14, PAPER)
+    policy = NavigatedPolicy(inner, partial(Navigator, settings), FULL, 2, 1.0, PAPER)
+    policy.set_periods([0.14, 0.14])
+    return inner, policy
 
 
 def test_an_agent_is_told_a_detour_where_its_way_is_blocked_and_the_observation_stays() -> None:
@@ -103,7 +105,7 @@ class Ahead(Told):
 
 def test_a_stop_zone_limits_who_has_something_ahead_and_leaves_the_other_alone() -> None:
     quiet = NavigatorSettings(replan=False, watchdog=None)
-    policy = NavigatedPolicy(Ahead(), partial(Navigator, quiet), FULL, 2, None, 0.14, PAPER, Guard(evade=False))
+    policy = NavigatedPolicy(Ahead(), partial(Navigator, quiet), FULL, 2, None, PAPER, Guard(evade=False))
     given = observation(True, v=0.6)
     near = sector_distances(1.0, 0.0, 0.0, WALL, np.empty((0, 3)))  # 0.5 m ahead
     given["range"][0] = torch.from_numpy(range_observation(near, FULL))
@@ -119,7 +121,8 @@ def test_a_stop_zone_limits_who_has_something_ahead_and_leaves_the_other_alone()
 def test_the_stop_zone_minds_what_has_left_the_view() -> None:
     narrow, pole = sensor_mask("narrow"), np.array([[0.38, 0.0, 0.1]])
     quiet = NavigatorSettings(replan=False, watchdog=None)
-    policy = NavigatedPolicy(Ahead(), partial(Navigator, quiet), narrow, 2, None, 0.14, PAPER, Guard(evade=False))
+    policy = NavigatedPolicy(Ahead(), partial(Navigator, quiet), narrow, 2, None, PAPER, Guard(evade=False))
+    policy.set_periods([0.14, 0.14])
     for step in range(9):  # the first agent turns left until the pole is at 64 degrees on its right
         ranges = sector_distances(0.0, 0.0, 0.14 * step, np.empty((0, 4)), pole)
         given = observation(step == 0)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -35,6 +35,8 @@ from rcdsac_trl.rollout.planners.trajectory_costs import (
     TrajectoryCosts,
     next_velocities,
 )
+from rcdsac_trl.world.task.episode import draw_motor_steps
+from rcdsac_trl.world.task.rules import TaskSettings
 from scenes import Scene
 from tiny import evaluate
 
@@ -298,6 +300,14 @@ def test_what_was_seen_and_is_out_of_view_still_costs() -> None:
     assert costs[8.0] > costs[0.5] + CostSettings().collision_m
 
 
+@pytest.mark.parametrize("period_s", [0.12, 0.16])
+def test_what_was_seen_is_where_the_episodes_own_period_leads(period_s: float) -> None:
+    known = TrajectoryCosts(PlannerSettings(), NARROW, 20, period_s=period_s)
+    for _ in range(11):
+        known.observe(NOTHING, np.full((2, 2), 3.0), np.array([0.5, 0.0, 0.5, 0.0]))
+    assert known.local_map.place[0] == pytest.approx(0.5 * 10 * period_s)
+
+
 def test_who_walks_into_the_way_costs_and_who_has_walked_out_does_not() -> None:
     # Where the robot is in 2.8 s, a mover is then, or is now.
     drive = np.full((1, 20, 2), (0.6, 0.0))
@@ -318,7 +328,7 @@ def test_who_walks_into_the_way_costs_and_who_has_walked_out_does_not() -> None:
 def test_open_space_is_driven_straight(make: Callable[[], Controller], sensor: str) -> None:
     scene = Scene(sensor=sensor)  # type: ignore[arg-type]
     controller = make()
-    controller.reset(scene.sensed, np.random.default_rng(0))
+    controller.reset(scene.sensed, np.random.default_rng(0), PERIOD_S)
     beside = []
     for _ in range(60):
         scene.move(*controller.act(*scene.observation()))
@@ -427,7 +437,7 @@ def test_an_agent_that_begins_forgets_and_the_others_do_not(name: str) -> None:
 class Creep:
     """A controller as a user writes one."""
 
-    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator, period_s: float) -> None:
         assert sensed.sum() == 43
         self.rng = rng
 
@@ -437,6 +447,16 @@ class Creep:
         assert velocity.shape == (4,)
         x, y = waypoints_m[0]
         return 0.2, math.atan2(y, x) + 0.1 * self.rng.standard_normal()
+
+
+class Noting(Creep):
+    """Notes the periods of its episodes."""
+
+    periods_s: ClassVar[list[float]] = []
+
+    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator, period_s: float) -> None:
+        super().reset(sensed, rng, period_s)
+        self.periods_s.append(period_s)
 
 
 class Fast(Creep):
@@ -465,7 +485,7 @@ class Broken(Creep):
 
 
 class NoAct:
-    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None: ...
+    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator, period_s: float) -> None: ...
 
 
 class Asks(Creep):
@@ -481,6 +501,16 @@ def test_desired_velocities_become_actions_and_are_clipped() -> None:
     assert slow[0] == pytest.approx(0.0)  # 0.2 m/s is the middle of -0.2 to 0.6
 
 
+def test_a_controller_is_told_the_period_of_its_episode(tmp_path: Path) -> None:
+    Noting.periods_s.clear()
+    evaluate(
+        f"baseline={HERE}:Noting", "num_maps=2", "num_episodes=6", "task.episode_steps=3", f"out={tmp_path / 'out'}"
+    )
+    steps = [draw_motor_steps(TaskSettings(), "evaluation", 0, map_, agent) for map_ in range(2) for agent in range(6)]
+    assert Noting.periods_s[-12:] == pytest.approx([MOTOR_PERIOD_S * each for each in steps])
+    assert len(set(steps)) == 3
+
+
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
@@ -490,7 +520,7 @@ def test_desired_velocities_become_actions_and_are_clipped() -> None:
         ("nowhere.at_all:C", "baseline=nowhere.at_all:C: cannot import nowhere.at_all: ModuleNotFoundError: "),
         (f"{HERE}:Nobody", f"baseline={HERE}:Nobody: module {HERE} has no Nobody"),
         (f"{HERE}:Asks", f"baseline={HERE}:Asks: cannot call Asks() without arguments: TypeError: "),
-        (f"{HERE}:NoAct", f"baseline={HERE}:NoAct has no act(): a controller has reset(sensed, rng) and act("),
+        (f"{HERE}:NoAct", f"baseline={HERE}:NoAct has no act(): a controller has reset(sensed, rng, period_s) and"),
         (f"{HERE}:Silent", f"baseline={HERE}:Silent answered None: act() must return the desired velocities, two"),
         (f"{HERE}:NotANumber", f"baseline={HERE}:NotANumber answered (0.1, nan): act() must return"),
         (f"{HERE}:Three", f"baseline={HERE}:Three answered (0.1, 0.2, 0.3): act() must return"),

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import safetensors.torch
 import torch
@@ -88,6 +88,12 @@ class EvaluationSpec:
     acting: ActingSettings = BY_MEAN
 
 
+class _Timed(Protocol):
+    """A policy that reckons with how long a step takes."""
+
+    def set_periods(self, periods_s: Sequence[float]) -> None: ...
+
+
 class Agent(NamedTuple):
     """A trained agent as bytes, which go from process to process.
 
@@ -131,11 +137,13 @@ def map_evaluator(
             policy = _choosing(spec, policy, loss)
     planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
-    foresighted = None
+    timed: list[_Timed] = [] if planner is None else [planner]
     if spec.latency_s:
-        policy = foresighted = _foresighted(spec, policy, len(agent_ids))
+        policy = _foresighted(spec, policy, len(agent_ids))
+        timed.append(policy)
     if any(asdict(spec.navigation).values()):
         policy = _navigated(spec, policy, len(agent_ids))
+        timed.append(policy)
     if spec.controller is not None:
         policy = adaptive = _adaptive(spec, spec.controller, policy, loss)
         more.append(lambda *_: {"mean_beta": adaptive.mean_betas()})
@@ -147,8 +155,8 @@ def map_evaluator(
         noise.begin(spec.seed, "evaluation actions", map_index)
         if planner is not None:
             planner.set_map(map_index)
-        if foresighted is not None:
-            foresighted.set_periods(_periods_s(spec, map_index).tolist())
+        for each in timed:
+            each.set_periods(_periods_s(spec, map_index).tolist())
         return measure_map(
             worker,
             policy,
@@ -192,7 +200,6 @@ def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: i
         robot.sensor_mask(spec.world.sensor),
         num_agents,
         boldest=algo.distortion.measure.high if asked.watchdog and algo.context_key == "risk" else None,
-        period_s=sum(spec.world.task.motor_steps) / len(spec.world.task.motor_steps) * robot.motor_period_s,
         robot=robot,
         guard=CompiledGuard.of(robot) if asked.stop_zone else None,
     )

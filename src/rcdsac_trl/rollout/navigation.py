@@ -1,6 +1,6 @@
 """The navigation around an agent, in a simulation: the same as on a robot, for a whole worker."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -31,15 +31,12 @@ def navigator_of(
 class NavigatedPolicy(TensorDictModuleBase):
     """A policy whose agents are advised, each by a navigator of its own.
 
-    Agents are not told how long a step takes: it counts as the middle of the task's periods.
-
     Args:
         policy: acts on `waypoint`, and on `risk` if its agents are told one.
         make: makes a navigator.
         sensed: which of the 180 sectors the sensor has, bool [180].
         num_agents: that it acts for.
         boldest: the beta towards which an agent that stands still is turned; None: agents are told none.
-        period_s: of a step, s.
         robot: that is driven.
         guard: stands between the agents and the wheels, and minds what their navigators know; None: nothing does.
     """
@@ -51,7 +48,6 @@ class NavigatedPolicy(TensorDictModuleBase):
         sensed: NDArray[np.bool_],
         num_agents: int,
         boldest: float | None,
-        period_s: float,
         robot: RobotSettings = PAPER,
         guard: Guard | None = None,
     ) -> None:
@@ -61,9 +57,13 @@ class NavigatedPolicy(TensorDictModuleBase):
         self._navigators = [make() for _ in range(num_agents)]
         self._sensed = sensed
         self._boldest = boldest
-        self._period_s = period_s
         self._robot = robot
         self._guard = guard
+        self._periods_s = [0.0] * num_agents
+
+    def set_periods(self, periods_s: Sequence[float]) -> None:
+        """Say how long a step of each agent's next episode takes, s."""
+        self._periods_s = list(periods_s)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, acting on what the navigators say; observations stay as they were."""
@@ -102,7 +102,7 @@ class NavigatedPolicy(TensorDictModuleBase):
             if begins[row]:
                 navigator.reset()
             (x, y), (x_after, y_after) = waypoints[row]
-            elapsed_s = 0.0 if begins[row] else self._period_s
+            elapsed_s = 0.0 if begins[row] else self._periods_s[row]
             following = (x, y), (x_after, y_after)
             advice.append(navigator.advise(distances_m[row], self._sensed, following, velocities[row], elapsed_s))
         return advice

@@ -33,6 +33,9 @@ _NEARBY_M = 1.5
 _REPLAN_S, _CORNER_M = 0.4, 0.3
 # Two waypoints nearer to each other are one, the goal.
 _SAME_M = 1e-3
+# What walks is told by so many points around its middle, 4 cm apart.
+_TURNS_RAD = np.linspace(0.0, 2.0 * math.pi, 40, endpoint=False)
+_AROUND = np.stack([np.cos(_TURNS_RAD), np.sin(_TURNS_RAD)], axis=1)
 # Where a map is known, detours are planned on so large a square of it, m: the way around a wall may be long.
 _WIDE_M = 20.0
 
@@ -245,15 +248,23 @@ class Navigator:
     ) -> NDArray[np.float64]:
         """Return what is known of all sectors: seen, remembered where they are not, or on the map; m, float64 [180].
 
+        What walks is expected where its velocity has led it since it left the view.
+
         Args:
             distances_m: of the range sensor, as in :meth:`advise`.
             covered: likewise.
             pose: likewise.
         """
-        remembered_m = self._nearest_m(seen_from(self._map.remembered, self._map.pose))
-        known_m = np.where(covered, distances_m, remembered_m)
+        remembered = np.concatenate([self._map.remembered, self._edges_of_movers()])
+        known_m = np.where(covered, distances_m, self._nearest_m(seen_from(remembered, self._map.pose)))
         # On the map is what no sensor sees, too.
         return np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M, pose)))
+
+    def _edges_of_movers(self) -> NDArray[np.float64]:
+        """Return points around what walks, where it is expected now, in the frame of the odometry, m, [k, 2]."""
+        moving = self._tracks.moving
+        edges: NDArray[np.float64] = moving[:, None, :2] + moving[:, None, 4:5] * _AROUND
+        return edges.reshape(-1, 2)
 
     def _nearest_m(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far the nearest of points in the robot's frame is, by sector, float64 [180]; ``inf``: none."""

@@ -95,7 +95,7 @@ def _imported(name: str, own: OwnClass) -> Callable[[], Controller]:
     lacking = [method for method in ("reset", "act") if not callable(getattr(made, method, None))]
     if lacking:
         raise UserInputError(
-            f"baseline={name} has no {lacking[0]}(): a controller has reset(sensed, rng) and "
+            f"baseline={name} has no {lacking[0]}(): a controller has reset(sensed, rng, period_s) and "
             "act(ranges_m, waypoints_m, velocity)"
         )
     return make

@@ -16,6 +16,9 @@ from rcdsac_trl.robot.observation import range_distances, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.seeding import stream
 
+MEAN_PERIOD_S = 0.14
+"""The mean control period of the paper's task, s; an episode's is 0.12, 0.14 or 0.16."""
+
 
 class Controller(Protocol):
     """Drives one robot with what an agent is told, decoded to metres: no pose, no map.
@@ -24,13 +27,14 @@ class Controller(Protocol):
     ``baseline=<module>:<class>``. Limits and sizes of the robot that it drives it has to know itself.
     """
 
-    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator, period_s: float) -> None:
         """Begin an episode, and forget the last one.
 
         Args:
             sensed: which of the 180 sectors the sensor has, bool [180]; sector i (from 0) covers [2i, 2i + 2) degrees
                 counter-clockwise from straight ahead.
             rng: the only source of randomness to use; results repeat then.
+            period_s: how long after one call of :meth:`act` the next one follows in this episode, s.
         """
         ...
 
@@ -92,10 +96,15 @@ class ControllerPolicy(TensorDictModuleBase):
         self._seed = seed
         self._map_index = 0
         self._controllers = [make() for _ in self._agent_ids]
+        self._periods_s = [MEAN_PERIOD_S] * len(self._agent_ids)
 
     def set_map(self, map_index: int) -> None:
         """Choose the random streams of the episodes that begin from now on."""
         self._map_index = map_index
+
+    def set_periods(self, periods_s: Sequence[float]) -> None:
+        """Say how long a step of each agent's next episode takes, s."""
+        self._periods_s = list(periods_s)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`.
@@ -115,7 +124,8 @@ class ControllerPolicy(TensorDictModuleBase):
         actions = np.empty((len(self._controllers), 2), np.float32)
         for row, controller in enumerate(self._controllers):
             if is_init[row]:
-                controller.reset(self._sensed, stream(self._seed, self._name, self._map_index, self._agent_ids[row]))
+                noise = stream(self._seed, self._name, self._map_index, self._agent_ids[row])
+                controller.reset(self._sensed, noise, self._periods_s[row])
             actions[row] = self._action(controller.act(ranges_m[row], waypoints_m[row], velocities[row]))
         return tensordict.set("action", torch.from_numpy(actions).view(*tensordict.batch_size, -1))
 

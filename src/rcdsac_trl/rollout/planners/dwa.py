@@ -55,10 +55,10 @@ class Dwa:
         self._pairs = np.stack(np.meshgrid(v, omega, indexing="ij"), axis=-1).reshape(-1, 2)
         self._controls = np.repeat(self._pairs[:, None], self.settings.steps, axis=1)
 
-    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator, period_s: float) -> None:
         """Begin an episode, and forget the last one; nothing is random."""
         settings = self.settings
-        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps, self._robot)
+        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps, self._robot, period_s)
 
     def act(
         self, ranges_m: NDArray[np.float64], waypoints_m: NDArray[np.float64], velocity: NDArray[np.float64]

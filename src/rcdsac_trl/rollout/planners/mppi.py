@@ -71,10 +71,10 @@ class Mppi:
         self._limits = robot.min_linear_velocity, robot.max_speed_m_per_s, robot.max_angular_velocity
         self._knots = (self.settings.steps - 1) // self.settings.knot_steps + 2
 
-    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    def reset(self, sensed: NDArray[np.bool_], rng: np.random.Generator, period_s: float) -> None:
         """Begin an episode, and forget the last one."""
         settings = self.settings
-        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps, self._robot)
+        self._costs = TrajectoryCosts(settings.common, sensed, settings.steps, self._robot, period_s)
         self._rng = rng
         self._plan = np.zeros((settings.steps, 2))
 

@@ -20,11 +20,11 @@ from rcdsac_trl.system.jit import njit
 from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE, TaskSettings
 
 PERIOD_S = 0.14
-"""The mean control period of the paper's task; the real one, 0.12 to 0.16 s, an agent is not told."""
+"""Step of the trajectories, s, as long as the mean control period; compiled code reads it."""
 
 # Waypoints nearer to each other are one: the goal.
 _SAME_M = 1e-3
-# A velocity that is missed by more was taken away by contact: a control period that is not known explains 0.03 m/s.
+# A velocity that is missed by more was taken away by contact.
 _STALLED_M_PER_S = 0.08
 # Side of a cell of the cost-to-go, in cells of the local map.
 _COARSER = 2
@@ -103,6 +103,7 @@ class TrajectoryCosts:
         sensed: which of the 180 sectors the sensor has, bool [180].
         steps: of the trajectories, :data:`PERIOD_S` each.
         robot: that drives; its circumcircle stands for it.
+        period_s: from one observation to the next, s.
 
     Attributes:
         local_map: what stands.
@@ -110,7 +111,12 @@ class TrajectoryCosts:
     """
 
     def __init__(
-        self, settings: PlannerSettings, sensed: NDArray[np.bool_], steps: int, robot: RobotSettings = PAPER
+        self,
+        settings: PlannerSettings,
+        sensed: NDArray[np.bool_],
+        steps: int,
+        robot: RobotSettings = PAPER,
+        period_s: float = PERIOD_S,
     ) -> None:
         self.local_map = LocalMap(settings.local_map, sensed, robot.lidar.max_range_m)
         self.tracks = MoverTracks(settings.tracks, sensed, robot.lidar.max_range_m)
@@ -131,6 +137,7 @@ class TrajectoryCosts:
         self._reach_m = robot.max_speed_m_per_s * PERIOD_S * steps + settings.cost.waypoint_radius_m
         self._state = 0.0, 0.0, 0.0, 0.0, 0.0
         self._moving = self.tracks.moving
+        self._period_s = period_s
         self._elapsed_s = 0.0
 
     def observe(
@@ -145,7 +152,7 @@ class TrajectoryCosts:
         self.tracks.observe(ranges_m, local_map.pose, self._elapsed_s)
         self._moving = self.tracks.moving
         local_map.observe(ranges_m, self._moving)
-        self._elapsed_s = PERIOD_S
+        self._elapsed_s = self._period_s
         x, y, yaw = local_map.pose.tolist()
         self._state = x, y, yaw, v, omega
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -164,7 +171,7 @@ class TrajectoryCosts:
         """
         _, _, _, v_before, omega_before = self._state
         limits = self._robot.acceleration, self._robot.turn_acceleration
-        expected, _ = next_velocities(v_u, omega_u, v_before, omega_before, PERIOD_S, *limits)
+        expected, _ = next_velocities(v_u, omega_u, v_before, omega_before, self._period_s, *limits)
         return expected if self._elapsed_s > 0.0 and abs(expected) > abs(v) + _STALLED_M_PER_S else 0.0
 
     def of(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
