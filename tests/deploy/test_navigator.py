@@ -151,6 +151,24 @@ def test_what_is_out_of_view_is_told_to_the_stop_zone() -> None:
     assert advice.been[0] == pytest.approx((-x, 0.0), abs=0.1)
 
 
+def test_who_has_just_walked_out_of_view_is_told_to_the_stop_zone_where_it_is_by_now() -> None:
+    navigator = Navigator(replace(AT_ONCE, replan=False))
+    for step in range(25):  # it crosses at 0.5 m/s, and is seen whole for 13 steps
+        y = -0.5 + 0.07 * step
+        person = np.array([[0.8, y, 0.25]])
+        ranges = np.where(NARROW, sector_distances(0.0, 0.0, 0.0, np.empty((0, 4)), person), np.inf)
+        navigator.advise(ranges, NARROW, GOAL, (0.0, 0.0), 0.14 if step else 0.0)
+    assert np.isinf(ranges).all()
+    known_m = navigator.known(ranges, NARROW, None)
+    distance_m, bearing = math.hypot(0.8, y), math.degrees(math.atan2(y, 0.8))
+    assert known_m.min() == pytest.approx(distance_m - 0.25, abs=0.08)
+    told = np.flatnonzero(np.isfinite(known_m))
+    assert 2.0 * told.mean() == pytest.approx(bearing, abs=4.0)
+    for _ in range(20):  # by then it has turned, for all that is known
+        navigator.advise(ranges, NARROW, GOAL, (0.0, 0.0), 0.14)
+    assert np.isinf(navigator.known(ranges, NARROW, None)).all()
+
+
 # ------------------------------------------------------------------------------------------------ standstill
 SETTINGS = WatchdogSettings(still_s=2.0, bold_s=2.0, back_off_s=3.0, back_off_m=0.4)
 
