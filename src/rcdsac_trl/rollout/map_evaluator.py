@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple, Protocol
 
@@ -141,7 +141,7 @@ def map_evaluator(
     if spec.latency_s:
         policy = _foresighted(spec, policy, len(agent_ids))
         timed.append(policy)
-    if any(asdict(spec.navigation).values()):
+    if spec.navigation.replan or spec.navigation.watchdog or spec.navigation.stop_zone:
         policy = _navigated(spec, policy, len(agent_ids))
         timed.append(policy)
     if spec.controller is not None:
