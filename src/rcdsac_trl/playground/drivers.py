@@ -11,9 +11,10 @@ from rcdsac_trl.deploy import Command, Guard, Policy, Sectors, Weights
 from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
-from rcdsac_trl.rollout.planners.controller import MEAN_PERIOD_S, Controller
+from rcdsac_trl.rollout.planners.controller import Controller
 from rcdsac_trl.rollout.planners.dwa import Dwa
 from rcdsac_trl.rollout.planners.mppi import Mppi
+from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
 from rcdsac_trl.seeding import stream
 
 NUM_QUANTILES = 16
@@ -269,7 +270,7 @@ class PlannerDriver:
 
     def reset(self) -> None:
         """Forget everything before, its local map too."""
-        self._controller.reset(self._mask, stream(self._seed, self._name, 0, 0), MEAN_PERIOD_S)
+        self._controller.reset(self._mask, stream(self._seed, self._name, 0, 0), PERIOD_S)
 
     def act(self, situation: Situation, dialled: float | None) -> Command:
         """Return the planner's command."""

@@ -155,8 +155,9 @@ def map_evaluator(
         noise.begin(spec.seed, "evaluation actions", map_index)
         if planner is not None:
             planner.set_map(map_index)
+        periods_s = _periods_s(spec, map_index).tolist()
         for each in timed:
-            each.set_periods(_periods_s(spec, map_index).tolist())
+            each.set_periods(periods_s)
         return measure_map(
             worker,
             policy,

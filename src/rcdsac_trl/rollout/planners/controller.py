@@ -14,10 +14,8 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import range_distances, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
 from rcdsac_trl.seeding import stream
-
-MEAN_PERIOD_S = 0.14
-"""The mean control period of the paper's task, s; an episode's is 0.12, 0.14 or 0.16."""
 
 
 class Controller(Protocol):
@@ -96,7 +94,7 @@ class ControllerPolicy(TensorDictModuleBase):
         self._seed = seed
         self._map_index = 0
         self._controllers = [make() for _ in self._agent_ids]
-        self._periods_s = [MEAN_PERIOD_S] * len(self._agent_ids)
+        self._periods_s = [PERIOD_S] * len(self._agent_ids)
 
     def set_map(self, map_index: int) -> None:
         """Choose the random streams of the episodes that begin from now on."""

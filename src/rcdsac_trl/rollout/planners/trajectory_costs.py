@@ -20,7 +20,7 @@ from rcdsac_trl.system.jit import njit
 from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE, TaskSettings
 
 PERIOD_S = 0.14
-"""Step of the trajectories, s, as long as the mean control period; compiled code reads it."""
+"""Step of the trajectories, s: the mean control period of the paper's task. An episode's is 0.12, 0.14 or 0.16 s."""
 
 # Waypoints nearer to each other are one: the goal.
 _SAME_M = 1e-3
