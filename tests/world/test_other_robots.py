@@ -177,7 +177,7 @@ def test_a_robot_that_fits_through_no_passage_is_refused() -> None:
 def test_classical_planners_use_what_the_robot_can(make: Any) -> None:
     own = robot("turtlebot3_burger")
     planner = make(robot=own)
-    planner.reset(own.sensor_mask("full"), stream(0, "planner"))
+    planner.reset(own.sensor_mask("full"), stream(0, "planner"), 0.14)
     v, omega = planner.act(np.full(180, np.inf), np.array([[3.0, 0.0], [3.0, 0.0]]), np.array([0.22, 0.0, 0.22, 0.0]))
     assert 0.18 < v <= 0.22
     assert abs(omega) < own.max_angular_velocity
