@@ -195,8 +195,9 @@ def measured_of(name: str) -> Mapping[str, Any]:
 def _helped(evaluation: Path) -> str:
     """Say what navigated around an agent, as it stands behind its label."""
     asked = json.loads((evaluation / "evaluation.json").read_text(encoding="utf-8")).get("navigation") or {}
-    helps = [name for switch, name in (("replan", "detours"), ("watchdog", "watchdog")) if asked.get(switch)]
-    return f", with {' and '.join(helps)}" if helps else ""
+    names = {"replan": "detours", "watchdog": "watchdog", "stop_zone": "stop zone"}
+    helps = [name for switch, name in names.items() if asked.get(switch)]
+    return f", with {', '.join(helps[:-1])}{' and ' if helps[1:] else ''}{helps[-1]}" if helps else ""
 
 
 def _cells(condition: Mapping[str, Any]) -> list[str]:
