@@ -51,7 +51,16 @@ NAVIGATION = {
         *api_reference.PAGES,
         "reference/changelog",
     ],
-    "Explanation": ["agent", "world", "differences", "results", "study", "off-the-maps", "speed"],
+    "Explanation": ["agent", "world", "differences", "study", "off-the-maps", "speed"],
+    "Results": [
+        "results",
+        "results-paper",
+        "results-trainings",
+        "results-beta",
+        "results-navigation",
+        "results-calibration",
+        "results-earlier",
+    ],
 }
 
 project = "rcdsac_trl"

@@ -22,7 +22,7 @@ from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.ros.messages import static_layer_of
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.sectors import Mount
+from rcdsac_trl.robot.sectors import Mount, Sectors
 from robots import AHEAD, OPEN, STANDING, agent
 
 AT_ORIGIN = (0.0, 0.0, 0.0)
@@ -107,13 +107,14 @@ def test_a_detour_keeps_clear_of_a_pane_that_only_the_map_shows() -> None:
     advice = navigator.advise(OPEN, ALL, goal, (0.0, 0.0), 0.0, pose)
     corner = advice.waypoints[0]
     assert corner[1] < -0.8 - 0.2
-    assert navigator.known(OPEN, ALL, pose)[0] == math.inf  # 1.5 m and farther: no stop zone reaches there
+    # 1.5 m and farther: no stop zone reaches there.
+    assert navigator.known(Sectors(OPEN, ALL), pose).distances_m[0] == math.inf
     assert navigator.advise(OPEN, ALL, goal, (0.0, 0.0), 0.14).waypoints == goal  # nobody says where it is
 
 
 def test_the_stop_zone_minds_a_pane_in_a_sector_that_sees_through_it() -> None:
     navigator = Navigator(AT_ONCE, static_layer=StaticLayer.of_shapes(PANE))
-    known_m = navigator.known(OPEN, ALL, (0.7, 0.0, 0.0))
+    known_m = navigator.known(Sectors(OPEN, ALL), (0.7, 0.0, 0.0)).distances_m
     exact = seen((0.7, 0.0, 0.0), PANE)
     near = exact < 1.4
     assert near.sum() > 40

@@ -82,8 +82,8 @@ class NavigatedPolicy(TensorDictModuleBase):
             driven = each.instead
             if self._guard is not None:
                 wish = desired_velocities(action[row].tolist(), self._robot) if driven is None else driven
-                known_m = self._navigators[row].known(distances_m[row], self._sensed, None)
-                known = Sectors(known_m, self._sensed, self._robot.lidar.max_range_m)
+                seen = Sectors(distances_m[row], self._sensed, self._robot.lidar.max_range_m)
+                known = self._navigators[row].known(seen, None)
                 v, omega, limited = self._guard.limit(*wish, known, velocities[row], each.been)
                 driven = driven if limited is None else (v, omega)
             if driven is not None:

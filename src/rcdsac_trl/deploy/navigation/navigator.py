@@ -7,7 +7,7 @@ robot is on it: what that shows moves with every correction.
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from rcdsac_trl.robot.observation import AT_ORIGIN
 from rcdsac_trl.robot.planar import placed, seen_from
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
-from rcdsac_trl.robot.sectors import check_switches
+from rcdsac_trl.robot.sectors import Sectors, check_switches
 
 # Places that the robot was at are kept so far apart, and so many of them: for a metre and a half.
 _TRAIL_STEP_M, _TRAIL_PLACES = 0.02, 75
@@ -243,22 +243,21 @@ class Navigator:
             return np.empty((0, 2))
         return self.static_layer.around(pose, reach_m)
 
-    def known(
-        self, distances_m: NDArray[np.float64], covered: NDArray[np.bool_], pose: Pose | None
-    ) -> NDArray[np.float64]:
-        """Return what is known of all sectors: seen, remembered where they are not, or on the map; m, float64 [180].
+    def known(self, sectors: Sectors, pose: Pose | None) -> Sectors:
+        """Return what a stop zone minds: what is seen, remembered where nothing is, or on the map.
 
         What walks is expected where its velocity has led it since it left the view.
 
         Args:
-            distances_m: of the range sensor, as in :meth:`advise`.
-            covered: likewise.
-            pose: likewise.
+            sectors: what the range sensor says.
+            pose: as in :meth:`advise`.
         """
         remembered = np.concatenate([self._map.remembered, self._edges_of_movers()])
-        known_m = np.where(covered, distances_m, self._nearest_m(seen_from(remembered, self._map.pose)))
+        unseen_m = self._nearest_m(seen_from(remembered, self._map.pose))
+        known_m = np.where(sectors.covered, sectors.distances_m, unseen_m)
         # On the map is what no sensor sees, too.
-        return np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M, pose)))
+        known_m = np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M, pose)))
+        return replace(sectors, distances_m=known_m)
 
     def _edges_of_movers(self) -> NDArray[np.float64]:
         """Return points around what walks, where it is expected now, in the frame of the odometry, m, [k, 2]."""

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -430,8 +429,7 @@ class Policy:
         """Return what the stop zone minds: what is sensed, and what the navigator knows besides."""
         if self.navigator is None:
             return sectors
-        known_m = self.navigator.known(sectors.distances_m, sectors.covered, on_map)
-        return replace(sectors, distances_m=known_m)
+        return self.navigator.known(sectors, on_map)
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""
