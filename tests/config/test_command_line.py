@@ -13,10 +13,11 @@ from omegaconf import OmegaConf
 
 from rcdsac_trl import draw_maps
 from rcdsac_trl.cli import read_arguments
+from rcdsac_trl.config.calibration_settings import CalibrationSettings
 from rcdsac_trl.config.command_line import expanded
 from rcdsac_trl.config.compose import choices, compose, output_folder, parse
 from rcdsac_trl.config.course_settings import CourseSettings
-from rcdsac_trl.config.evaluation_settings import CalibrationSettings, EvaluationSettings
+from rcdsac_trl.config.evaluation_settings import EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.run_config import read_config, training_settings
 from rcdsac_trl.errors import UserInputError

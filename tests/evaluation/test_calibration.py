@@ -10,9 +10,9 @@ import torch
 from omegaconf import OmegaConf
 
 import tiny
+from rcdsac_trl.config.calibration_settings import CalibrationSettings
 from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.config.evaluation_settings import CalibrationSettings
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.branches import fractions, predict, roll_out

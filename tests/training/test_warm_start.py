@@ -13,8 +13,8 @@ from torchrl.objectives import LossModule
 
 import tiny
 from rcdsac_trl import train
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.compose import compose
-from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import settings_of_run, training_settings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
@@ -157,7 +157,7 @@ def test_a_run_that_trains_on_is_taken_as_it_was_when_it_was_checked(
 ) -> None:
     looks: list[Saved] = []
 
-    def first_only(folder: Path, name: Name) -> tuple[Saved, list[str]]:
+    def first_only(folder: Path, name: CheckpointName) -> tuple[Saved, list[str]]:
         # Its first checkpoint was the last one at the first look; by the second there is another.
         looks.append(find(folder, name if looks else 1)[0])
         return looks[-1], []

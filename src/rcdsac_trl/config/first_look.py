@@ -8,15 +8,12 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from rcdsac_trl.config.calibration_settings import CalibrationSettings
 from rcdsac_trl.config.course_settings import CourseSettings
-from rcdsac_trl.config.evaluation_settings import (
-    CalibrationSettings,
-    EvaluationSettings,
-    ExportSettings,
-    PublishSettings,
-)
+from rcdsac_trl.config.evaluation_settings import EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training, find_agent
 from rcdsac_trl.config.play_settings import PlaySettings
+from rcdsac_trl.config.release_settings import ExportSettings, PublishSettings
 from rcdsac_trl.config.replay_settings import ReplaySettings
 from rcdsac_trl.config.run_config import agent_of_run, read_config
 from rcdsac_trl.config.shipped_settings import VerificationSettings

@@ -4,8 +4,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.compose import compose
-from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.config.run_config import (
     CHECKPOINTS,
     CONFIG_NAME,
@@ -40,7 +40,9 @@ class NamedFolder:
         return settings_of_run(self.path) if self.is_run else settings_of_export(self.path)
 
 
-def find_agent(named: str | Path, checkpoint: Name | None = None, *, half_precision: bool = False) -> NamedFolder:
+def find_agent(
+    named: str | Path, checkpoint: CheckpointName | None = None, *, half_precision: bool = False
+) -> NamedFolder:
     """Return the folder of a name: of a run, one that ``export`` wrote, or that of an agent that is shipped.
 
     A run folder comes first, then a weights folder, then a shipped agent.

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.deploy import Mount
 from rcdsac_trl.deploy.sensors.scan import Meaning
 from rcdsac_trl.errors import UserInputError
@@ -15,7 +15,7 @@ class ReplaySettings:
 
     recording: str | None
     run: str
-    checkpoint: Name | None
+    checkpoint: CheckpointName | None
     beta: float | None
     waypoints: Literal["auto", "plan", "goal", "trajectory"]
     zero_means: Meaning | None

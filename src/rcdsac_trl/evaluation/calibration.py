@@ -12,8 +12,8 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from rcdsac_trl.agent.risk import RiskMeasure
+from rcdsac_trl.config.calibration_settings import CalibrationSettings
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.config.evaluation_settings import CalibrationSettings
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError

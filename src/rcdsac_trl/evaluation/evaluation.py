@@ -9,8 +9,9 @@ from typing import Any
 from omegaconf import DictConfig
 
 from rcdsac_trl.config.baseline_name import PURSUIT
+from rcdsac_trl.config.chosen_world import ChosenWorld
 from rcdsac_trl.config.command_line import assigned
-from rcdsac_trl.config.evaluation_settings import ChosenWorld, EvaluationSettings
+from rcdsac_trl.config.evaluation_settings import EvaluationSettings
 from rcdsac_trl.config.named_folder import default_training
 from rcdsac_trl.config.run_config import read_config
 from rcdsac_trl.config.training_settings import TrainingSettings

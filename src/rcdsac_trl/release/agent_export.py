@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from rcdsac_trl.config.evaluation_settings import ExportSettings
+from rcdsac_trl.config.release_settings import ExportSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy.export.exported import LIMIT, betas_of, check_extra, differences, export_agent
 from rcdsac_trl.deploy.policy.weights import Weights, packed

@@ -13,7 +13,7 @@ import torch
 from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule
 
-from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.named_folder import find_agent
 from rcdsac_trl.config.run_config import (
     CHECKPOINTS,
@@ -111,7 +111,7 @@ class RunAgent(NamedAgent):
     """
 
     folder: Path
-    checkpoint: Name
+    checkpoint: CheckpointName
     half_precision: bool = False
 
     @cached_property
@@ -265,7 +265,9 @@ def _temperature(weights: Weights) -> float | None:
     return temperature if isinstance(temperature, int | float) and 0.0 < temperature < math.inf else None
 
 
-def named_agent(named: str | Path, checkpoint: Name | None = None, *, half_precision: bool = False) -> NamedAgent:
+def named_agent(
+    named: str | Path, checkpoint: CheckpointName | None = None, *, half_precision: bool = False
+) -> NamedAgent:
     """Return the agent of a name: a run folder, a folder that ``export`` wrote, or an agent that is shipped.
 
     See :func:`~rcdsac_trl.config.named_folder.find_agent`.

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.command_line import assigned
-from rcdsac_trl.config.evaluation_settings import Name, PublishSettings
+from rcdsac_trl.config.release_settings import PublishSettings
 from rcdsac_trl.config.run_config import TRAINING_NAME, read_config
 from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
@@ -189,7 +190,7 @@ def _digest(small: Weights) -> str:
     return sha256(stored(small, half=True)).hexdigest()
 
 
-def _evaluation_of(run: Path, checkpoint: Name, digest: str, acting: ActingSettings) -> tuple[Path, bool]:
+def _evaluation_of(run: Path, checkpoint: CheckpointName, digest: str, acting: ActingSettings) -> tuple[Path, bool]:
     """Return the evaluation of a run that is published, and whether it drove the weights that ship.
 
     It is of that checkpoint, on evaluation maps, of the agent alone, which acted as the one that is published does. One
@@ -249,7 +250,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     return read
 
 
-def _calibration_of(run: Path, checkpoint: Name) -> Path | None:
+def _calibration_of(run: Path, checkpoint: CheckpointName) -> Path | None:
     """Return the calibration that is quoted: of that checkpoint, on evaluation maps, with most roll-outs."""
     found = {}
     for path in sorted(run.glob("calibration/*/calibration.json")):

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.command_line import assigned
-from rcdsac_trl.config.evaluation_settings import Name
 from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.distortion import fractions_of
@@ -107,7 +107,7 @@ def _command(agent: str, described: Mapping[str, Any], betas: Sequence[float]) -
     return " ".join(["python -m rcdsac_trl.calibrate", *given, *told])
 
 
-def driven_calibration(run: Path, checkpoint: Name, weights: Weights, split: str) -> Path | None:
+def driven_calibration(run: Path, checkpoint: CheckpointName, weights: Weights, split: str) -> Path | None:
     """Return where a run's agent was calibrated as it drives, with most states; None where it was not.
 
     It is of that checkpoint and these weights, and acted as they say. One of the weights as they ship, in half
@@ -136,7 +136,7 @@ def driven_calibration(run: Path, checkpoint: Name, weights: Weights, split: str
     return max(found, key=lambda folder: found[folder]) if found else None
 
 
-def with_offsets(weights: Weights, run: Path, checkpoint: Name) -> Weights:
+def with_offsets(weights: Weights, run: Path, checkpoint: CheckpointName) -> Weights:
     """Return a run's agent with the offsets that its calibration on validation maps asks for; as it is without one.
 
     Args:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rcdsac_trl.agent.risk import RiskMeasure
-from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.run_config import CHECKPOINTS, AgentOfRun, agent_of_run
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig, Context
@@ -29,7 +29,7 @@ TEMPERATURE = "temperature"
 """Key of an agent's provenance: what a nat of entropy was worth to its critics, as a reward."""
 
 
-def weights_of_run(folder: Path, checkpoint: Name) -> Weights:
+def weights_of_run(folder: Path, checkpoint: CheckpointName) -> Weights:
     """Read the agent of a run: the averaged actor, which is what evaluations drive, and the critics.
 
     Args:
@@ -141,7 +141,7 @@ def _embedding(measure: RiskMeasure) -> tuple[float, float]:
     return slope, offset
 
 
-def _provenance(folder: Path, checkpoint: Name, progress: Progress) -> dict[str, str | int | float | None]:
+def _provenance(folder: Path, checkpoint: CheckpointName, progress: Progress) -> dict[str, str | int | float | None]:
     manifest = {}
     if (path := folder / "manifest.json").is_file():
         manifest = json.loads(path.read_bytes())

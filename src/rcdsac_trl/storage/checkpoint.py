@@ -14,7 +14,7 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.checkpoint import Checkpoint, CheckpointError, StateDictCheckpointAdapter
 from torchrl.objectives import LossModule
 
-from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage import atomic as durable
 from rcdsac_trl.storage import replay_files
@@ -147,7 +147,7 @@ def _named_segments(folder: Path, keep: int) -> set[str]:
 
 
 def load_weights(
-    folder: Path, name: Name, *, loss: LossModule | None = None, average: AveragedModel | None = None
+    folder: Path, name: CheckpointName, *, loss: LossModule | None = None, average: AveragedModel | None = None
 ) -> list[str]:
     """Load the weights of a checkpoint into a loss, an averaged actor, or both, of the same shape.
 
@@ -197,7 +197,7 @@ class _State:
         self.state = state
 
 
-def load_states(folder: Path, name: Name) -> tuple[Saved, dict[str, Mapping[str, torch.Tensor]], list[str]]:
+def load_states(folder: Path, name: CheckpointName) -> tuple[Saved, dict[str, Mapping[str, torch.Tensor]], list[str]]:
     """Load the tensors of a checkpoint's loss and averaged actor by name, without making either.
 
     Returns:

@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage import atomic as durable
 from rcdsac_trl.storage import replay_segments
@@ -107,7 +107,7 @@ def newest(folder: Path, *, replay: Path | None = None) -> tuple[Saved, list[str
     raise UserInputError(f"there is no checkpoint in {folder}: has this run saved one yet?")
 
 
-def find(folder: Path, name: Name) -> tuple[Saved, list[str]]:
+def find(folder: Path, name: CheckpointName) -> tuple[Saved, list[str]]:
     """Find a checkpoint of a run; see :func:`newest`.
 
     Raises:
@@ -132,7 +132,7 @@ def find(folder: Path, name: Name) -> tuple[Saved, list[str]]:
         raise UserInputError(f"{which} {path} is damaged: {error}; checkpoint=last is whole") from error
 
 
-def load_progress(folder: Path, name: Name) -> Progress:
+def load_progress(folder: Path, name: CheckpointName) -> Progress:
     """Read how far a run was at a checkpoint.
 
     Raises:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from rcdsac_trl.config.evaluation_settings import Name
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.named_folder import find_agent
 from rcdsac_trl.config.run_config import CHECKPOINTS, REPLAY
 from rcdsac_trl.config.training_settings import TrainingSettings
@@ -89,7 +89,7 @@ def go_on(learner: Learner, settings: TrainingSettings, ended: EndedRun) -> str:
     )
 
 
-def begin_with_agent(learner: Learner, settings: TrainingSettings, checkpoint: Name = "last") -> str:
+def begin_with_agent(learner: Learner, settings: TrainingSettings, checkpoint: CheckpointName = "last") -> str:
     """Give a learner the networks of the agent that ``init`` names, and say in a sentence what it was not given.
 
     A run's are those of a checkpoint: actor, averaged actor, critics, target critics and temperature. Of an
