@@ -79,8 +79,7 @@ def table_of(names: list[str]) -> str:
 
 def _conditions(name: str) -> list[Mapping[str, Any]]:
     whose, _, chosen = name.partition(":")
-    measured = measured_of(whose)
-    conditions = [each | {"label": each["label"] + measured.get("helped", "")} for each in measured["conditions"]]
+    conditions: list[Mapping[str, Any]] = measured_of(whose)["conditions"]
     if not chosen:
         return conditions
     by_beta = {condition["beta"]: condition for condition in conditions}
@@ -189,15 +188,7 @@ def measured_of(name: str) -> Mapping[str, Any]:
     evaluations = sorted((ROOT / "results" / name).glob("evaluation/*"))
     if len(evaluations) != 1:
         raise SystemExit(f"{name} is neither in weights/ nor, with one evaluation, in results/: correct the comment")
-    return measured_values(evaluations[0]) | {"helped": _helped(evaluations[0])}
-
-
-def _helped(evaluation: Path) -> str:
-    """Say what navigated around an agent, as it stands behind its label."""
-    asked = json.loads((evaluation / "evaluation.json").read_text(encoding="utf-8")).get("navigation") or {}
-    names = {"replan": "detours", "watchdog": "watchdog", "stop_zone": "stop zone"}
-    helps = [name for switch, name in names.items() if asked.get(switch)]
-    return f", with {', '.join(helps[:-1])}{' and ' if helps[1:] else ''}{helps[-1]}" if helps else ""
+    return measured_values(evaluations[0])
 
 
 def _cells(condition: Mapping[str, Any]) -> list[str]:

@@ -187,6 +187,7 @@ def made_up(value: Callable[[pd.Series, str], Array], table: pd.DataFrame | None
             {
                 **row[["agent", "beta", "collision_weight", "sensor"]].to_dict(),
                 "measure": None,
+                "helped": "",
                 "beta_controller": None,
                 "train_seed": 0,
                 "map": np.repeat(np.arange(MAPS), EPISODES),

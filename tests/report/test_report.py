@@ -192,6 +192,20 @@ def test_the_same_agent_twice_is_refused_but_another_training_seed_is_not(tmp_pa
     assert values.mean((1, 2)).tolist() == [1.0, 3.0]
 
 
+def test_what_stands_between_an_agent_and_the_wheels_is_named_and_not_averaged_away(tmp_path: Path) -> None:
+    every = {"replan": True, "watchdog": True, "stop_zone": True}
+    helped = evaluate(tmp_path / "helped", "sac", {NONE: 0}, navigation=every)
+    zone = evaluate(tmp_path / "zone", "mppi", {NONE: 0}, navigation={"replan": False, "stop_zone": True})
+    alone = evaluate(tmp_path / "alone", "sac", {NONE: 2}, train_seed=1)
+    assert findings.labels(read_episodes([alone])) == ["SAC"]
+    assert findings.labels(read_episodes([helped, zone])) == [
+        "SAC, with detours, watchdog and stop zone",
+        "MPPI, with stop zone",
+    ]
+    with pytest.raises(UserInputError, match=r"=1 with detours, watchdog and stop zone and acting.num_candidates=1\)"):
+        read_episodes([helped, alone])
+
+
 def test_seeds_of_an_agent_that_act_differently_are_not_averaged(tmp_path: Path) -> None:
     choice = {"num_candidates": 32, "spread": 1.0, "over_critics": "minimum"}
     chooses = evaluate(tmp_path / "chooses", "sac", {NONE: 0}, acting=choice)

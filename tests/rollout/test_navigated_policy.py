@@ -1,5 +1,6 @@
 """Navigators around the agents of a worker: what the policy is told, what is done, and an evaluation with them."""
 
+import json
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +16,11 @@ from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.navigation.watchdog import WatchdogSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import action_of
+from rcdsac_trl.robot.compiled_guard import CompiledGuard
 from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.range_sensor import sensor_mask
-from rcdsac_trl.robot.robot_settings import PAPER
+from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
 from rcdsac_trl.world.sim.lidar import sector_distances
@@ -106,6 +108,7 @@ class Ahead(Told):
 def test_a_stop_zone_limits_who_has_something_ahead_and_leaves_the_other_alone() -> None:
     quiet = NavigatorSettings(replan=False, watchdog=None)
     policy = NavigatedPolicy(Ahead(), partial(Navigator, quiet), FULL, 2, None, PAPER, Guard(evade=False))
+    policy.set_periods([0.14, 0.14])
     given = observation(True, v=0.6)
     near = sector_distances(1.0, 0.0, 0.0, WALL, np.empty((0, 3)))  # 0.5 m ahead
     given["range"][0] = torch.from_numpy(range_observation(near, FULL))
@@ -151,7 +154,42 @@ def test_a_stop_zone_stands_behind_agents_and_planners(tmp_path: Path) -> None:
     speeds = [pd.read_csv(out / "episodes.csv")["mean_speed_m_per_s"].mean() for out in (alone, kept)]
     assert speeds[0] != speeds[1]
     assert '"stop_zone": true' in (kept / "evaluation.json").read_text()
-    assert (evaluate("baseline=dwa", ZONE, f"out={tmp_path / 'c'}") / "episodes.csv").is_file()
+    # As versions before the stop zone wrote it, so that they can be repeated in their folders.
+    assert json.loads((alone / "evaluation.json").read_bytes())["navigation"] == {"replan": False, "watchdog": False}
+
+
+def test_a_stop_zone_stands_behind_a_baseline_and_has_a_folder_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    asked = "baseline=pursuit", "task.episode_steps=150", "map.num_movers=0", "sensor=full"
+    alone, kept = evaluate(*asked), evaluate(*asked, ZONE)
+    assert kept.name == alone.name + "-stop_zone"
+    collisions = [pd.read_csv(out / "episodes.csv")["collisions"].sum() for out in (alone, kept)]
+    assert collisions[0] > 0
+    assert collisions[1] == 0
+
+
+def test_the_stop_zone_of_agents_that_allow_for_a_latency_looks_so_much_farther(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, _, _ = untrained_run(tmp_path / "run", "sac", "sensor.memory_s=5", "network.range_code=nearness")
+    made = []
+
+    def of(robot: RobotSettings, **changes: float) -> Guard:
+        made.append(changes)
+        return Guard.of(robot, **changes)
+
+    monkeypatch.setattr(CompiledGuard, "of", of)
+    evaluate(f"run={run}", "checkpoint=last", "latency_s=0.28", ZONE)
+    assert made == [{"reaction_s": pytest.approx(0.25 + 0.28)}]
+
+
+def test_who_is_not_told_how_long_a_step_takes_refuses() -> None:
+    policy = NavigatedPolicy(Told(), Navigator, FULL, 2, 1.0, PAPER)
+    policy(observation(True))  # of the first step nothing has passed
+    with pytest.raises(RuntimeError, match=r"NavigatedPolicy does not know how long a step takes: call set_periods"):
+        policy(observation(False))
 
 
 def test_nothing_navigates_unless_it_is_asked_for() -> None:

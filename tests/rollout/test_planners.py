@@ -393,6 +393,7 @@ def actions(name: str, agent_ids: list[int], *, seed: int = 0, map_index: int = 
     """Return what a baseline does with some agents, [steps, agents, 2]."""
     policy = baseline_policy(name, sensor="narrow", agent_ids=agent_ids, seed=seed)
     assert isinstance(policy, ControllerPolicy)
+    policy.set_periods([PERIOD_S] * len(agent_ids))
     policy.set_map(map_index)
     scenes = scenes_of(agent_ids)
     return np.stack([policy(observations(scenes, step == 0))["action"].numpy() for step in range(steps)])
@@ -410,6 +411,8 @@ def test_the_same_seed_gives_the_same_actions_whoever_else_there_is(name: str) -
 
 def test_noise_derives_from_seed_map_and_agent() -> None:
     policy = baseline_policy("mppi", sensor="narrow", agent_ids=[0, 1], seed=0)
+    assert isinstance(policy, ControllerPolicy)
+    policy.set_periods([PERIOD_S, PERIOD_S])
     same = scenes_of([0, 0])
     first = policy(observations(same, True))["action"]
     assert not torch.equal(first[0], first[1])
@@ -421,6 +424,8 @@ def test_noise_derives_from_seed_map_and_agent() -> None:
 @pytest.mark.parametrize("name", ["dwa", "mppi"])
 def test_an_agent_that_begins_forgets_and_the_others_do_not(name: str) -> None:
     policy = baseline_policy(name, sensor="narrow", agent_ids=[0, 1], seed=0)
+    assert isinstance(policy, ControllerPolicy)
+    policy.set_periods([PERIOD_S, PERIOD_S])
     scenes = scenes_of([0, 1])
     first = policy(observations(scenes, True))["action"].clone()
     second = policy(observations(scenes, False))["action"].clone()

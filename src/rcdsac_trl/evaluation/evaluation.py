@@ -138,11 +138,11 @@ def _name(settings: EvaluationSettings, trained: TrainingSettings) -> str:
 def _default_out(settings: EvaluationSettings, spec: EvaluationSpec, named: NamedAgent | None, num_maps: int) -> Path:
     maps = "barn" if spec.one_trip else settings.split
     name = f"{maps}-seed{settings.seed}-{num_maps}x{settings.num_episodes}"
+    name += "".join(f"-{part}" for part, is_on in asdict(spec.navigation).items() if is_on)
     if named is None:
         if spec.world.robot != PAPER:
             name = f"{spec.world.robot.name}-{name}"
         return Path("evaluation") / f"{settings.baseline}-{spec.world.sensor}-{name}".replace(":", "-")
-    name += "".join(f"-{part}" for part, is_on in asdict(spec.navigation).items() if is_on)
     name += f"-latency_{spec.latency_s:g}" if spec.latency_s else ""
     name += "".join(f"-{part}_{value}" for part, value in settings.acting.given.items())
     contexts = "".join(f"-{condition}".replace("=", "_") for condition in spec.conditions)
@@ -168,7 +168,7 @@ def _described(
         "num_episodes": settings.num_episodes,
         "sampled": settings.sampled,
         "acting": None if named is None else asdict(spec.acting),
-        "navigation": asdict(settings.navigation),
+        "navigation": _navigation(settings),
         "conditions": [str(condition) for condition in spec.conditions],
         "map": asdict(spec.world.map_settings),
         "task": asdict(spec.world.task),
@@ -179,6 +179,12 @@ def _described(
     if spec.controller is not None:
         described["controller"] = asdict(spec.controller)
     return described if settings.baseline is None else described | settings_of(settings.baseline)
+
+
+def _navigation(settings: EvaluationSettings) -> dict[str, bool]:
+    """Say what stands between the agents and the wheels; no stop zone that is off: earlier versions had none."""
+    described = asdict(settings.navigation)
+    return {name: is_on for name, is_on in described.items() if is_on or name != "stop_zone"}
 
 
 def _findings(rows: Rows) -> Findings:

@@ -25,12 +25,15 @@ _BETTER_DOWN = {"collisions"}
 
 
 def labels(episodes: Episodes) -> list[str]:
-    """Name the conditions, in their order."""
+    """Name the conditions, in their order, with what stood between the agent and the wheels."""
     sensors = episodes.conditions["sensor"].nunique()
     columns = (episodes.conditions[key].tolist() for key in CONDITION)
     agents, names, betas, weights, controllers = columns
-    rows = zip(agents, names, betas, weights, controllers, strict=True)
-    return [condition_label(agent, name, beta, weight, by, sensors) for agent, name, beta, weight, by in rows]
+    helps = (f", with {helped}" if helped else "" for helped in episodes.conditions["helped"])
+    rows = zip(agents, names, betas, weights, controllers, helps, strict=True)
+    return [
+        condition_label(agent, name, beta, weight, by, sensors) + help_ for agent, name, beta, weight, by, help_ in rows
+    ]
 
 
 def several_seeds(episodes: Episodes, conditions: pd.DataFrame) -> bool:

@@ -22,6 +22,8 @@ CONDITION = ("agent", "sensor", *TOLD)
 """Columns that say what drove an episode."""
 _OF_A_COLLISION = ("thing", "bearing_rad", "bearing_sensed", "unsensed_s")
 _EPISODE = ("train_seed", "map", "episode")
+# Keys of `navigation` in an evaluation, and what they are called.
+_HELPS = {"replan": "detours", "watchdog": "watchdog", "stop_zone": "stop zone"}
 # What must be equal for agents to have met the same maps, starts, goals and movers, under the same rules.
 _PROTOCOL = ("split", "seed", "num_maps", "num_episodes", "sampled", "map", "task")
 
@@ -79,6 +81,13 @@ class Evaluation:
         """What decides which maps, starts, goals and movers were met, and under which rules."""
         return {key: self.described[key] for key in _PROTOCOL}
 
+    @property
+    def helped(self) -> str:
+        """What stood between the agent and the wheels, such as "detours and watchdog"; empty: nothing did."""
+        asked = self.described.get("navigation") or {}  # evaluations of earlier versions say nothing: there was none
+        helps = [name for key, name in _HELPS.items() if asked.get(key)]
+        return " and ".join([*([", ".join(helps[:-1])] if helps[1:] else []), *helps[-1:]])
+
 
 def read_evaluation(folder: Path) -> Evaluation:
     """Read an evaluation.
@@ -125,7 +134,8 @@ class Episodes:
 
     Attributes:
         table: one row an episode: :data:`CONDITION`, `mean_beta`, `train_seed`, `map`, `episode`, the metrics that
-            all have, and `diagnosed`: whether its collisions are among `collisions`.
+            all have, `helped` as in :class:`Evaluation`, and `diagnosed`: whether its collisions are among
+            `collisions`.
         protocol: of all evaluations.
         collisions: one row a collision, of the evaluations that wrote ``collisions.csv``, with :data:`CONDITION`.
     """
@@ -141,8 +151,8 @@ class Episodes:
 
     @cached_property
     def conditions(self) -> pd.DataFrame:
-        """One row a condition, with the agent's measure, by evaluation, beta, and controller of it."""
-        rows = self.table[[*CONDITION, "measure"]].drop_duplicates()
+        """One row a condition, with the agent's measure and `helped`, by evaluation, beta, and controller of it."""
+        rows = self.table[[*CONDITION, "measure", "helped"]].drop_duplicates()
         agents = list(rows["agent"].unique())
         rows = rows.assign(order=rows["agent"].map(agents.index))
         by = ["sensor", "order", "beta", "collision_weight", "beta_controller"]
@@ -173,6 +183,7 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
             agent=evaluation.described["agent"],
             sensor=evaluation.described["sensor"],
             measure=evaluation.described.get("measure"),
+            helped=evaluation.helped,
             train_seed=evaluation.described.get("train_seed") or 0,
             folder=str(evaluation.folder),
             diagnosed=evaluation.collisions is not None,
@@ -231,7 +242,7 @@ def _check_same_acting(evaluations: Sequence[Evaluation]) -> None:
         if here != there:
             raise UserInputError(
                 f"{first.folder} and {other.folder} let {agent[0]} act differently ({here} and {there}): evaluate them "
-                "with the same acting.*, or report on them apart"
+                "with the same acting.*, latency_s and navigation.*, or report on them apart"
             )
 
 
@@ -243,7 +254,7 @@ def _acting_of(evaluation: Evaluation) -> str:
     said = [f"acting.{name}={value}" for name, value in acting.items()]
     if latency_s := evaluation.described.get("latency_s"):
         said.append(f"latency_s={latency_s:g}")
-    return " ".join(said)
+    return " ".join(said) + (f" with {evaluation.helped}" if evaluation.helped else "")
 
 
 def _same_robot(one: dict[str, Any] | None, other: dict[str, Any] | None) -> bool:

@@ -142,9 +142,10 @@ class Guard:
     ) -> tuple[float, float, str | None]:
         """Return the velocities that may be driven, and why they are not those that were wanted.
 
-        The linear velocity is lowered, to 0 if need be; turning on the spot is always allowed. Where it would be 0, and
-        the robot may evade, it creeps with another turn, the nearest to the wish that keeps the stop zone free; where
-        there is none, it turns towards the nearest heading in which there is.
+        The linear velocity is lowered, to 0 if need be. Where it would be 0, and the robot may evade, it creeps with
+        another turn, the nearest to the wish that keeps the stop zone free; where there is none, it turns towards the
+        nearest heading in which there is. A disc may always turn on the spot; whose outline is guarded, as fast as no
+        corner swings into the stop zone.
 
         Args:
             v: wanted linear velocity, m/s.
@@ -159,17 +160,21 @@ class Guard:
         omega = min(max(omega, -self.max_turn_rad_per_s), self.max_turn_rad_per_s)
         reason = None if (v, omega) == (fast, turning) else "the speed limit"
         if v == 0.0:
-            return v, omega, reason
+            turn = self._turn_on_the_spot(omega, sectors, moving)
+            return 0.0, turn, reason if turn == omega else "the stop zone"
         if self.blind_reverse or np.count_nonzero(sectors.covered[_AHEAD if v > 0.0 else _BEHIND]):
             been = None  # it sees where it goes
         elif v > 0.0 or been is None:
-            return 0.0, omega, f"nothing senses what lies {'ahead' if v > 0 else 'behind'}"
+            blind = f"nothing senses what lies {'ahead' if v > 0 else 'behind'}"
+            return 0.0, self._turn_on_the_spot(omega, sectors, moving), blind
         share = self._fastest(v, omega, sectors, moving, been)
-        if share == 0.0 and self.evade and v > 0.0:
-            return *self._evading(v, omega, sectors, moving), "the stop zone"
-        if share == 0.0:
-            return 0.0, omega, "the stop zone"
-        return share * v, omega, reason if share == 1.0 else "the stop zone"
+        if share > 0.0:
+            return share * v, omega, reason if share == 1.0 else "the stop zone"
+        if self.evade and v > 0.0:
+            v, omega = self._evading(v, omega, sectors, moving)
+            if v > 0.0:
+                return v, omega, "the stop zone"
+        return 0.0, self._turn_on_the_spot(omega, sectors, moving), "the stop zone"
 
     def _evading(self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float]) -> tuple[float, float]:
         """Return velocities that lead past what is in the way: creeping, or else turning on the spot."""
@@ -189,12 +194,49 @@ class Guard:
     def _turn_to_a_way(self, creep: float, omega: float, sectors: Sectors) -> float | None:
         """Return the turn that leads to the nearest heading in which the robot could creep on; None without one."""
         side = 1.0 if omega >= 0.0 else -1.0
+        swings = {way: self._free_swing(way, sectors) for way in (side, -side)}
         for bins in range(_HEADING_BINS, NUM_BINS // 2 + 1, _HEADING_BINS):
             for way in (side, -side):
+                if bins > swings[way]:
+                    continue
                 turned = np.roll(sectors.distances_m, -round(way * bins))
                 if self._fastest(creep, 0.0, replace(sectors, distances_m=turned), (0.0, 0.0)) >= _WORTH_IT:
                     return way * _TURN_SHARE * self.max_turn_rad_per_s
         return None
+
+    def _free_swing(self, way: float, sectors: Sectors) -> int:
+        """Return how many sectors far the robot can turn on the spot to a side, half of all at most: a disc that far.
+
+        Within the margin its corners come nearer little by little, so the least that must stay counts.
+        """
+        half = NUM_BINS // 2
+        borders, nearest = self._within_reach(sectors, 0.0)
+        if self._is_a_disc or not len(nearest):
+            return half
+        turned = way * BIN_RAD * np.arange(half + 1)
+        headings = np.stack((np.cos(turned), np.sin(turned)), axis=1)
+        clearance = self._clearances(np.zeros((1, half + 1, 2)), headings, borders, nearest)[0]
+        touching = np.flatnonzero(clearance < min(LEAST_M, float(clearance[0])))
+        return int(touching[0]) - 1 if len(touching) else half
+
+    def _turn_on_the_spot(self, omega: float, sectors: Sectors, moving: tuple[float, float]) -> float:
+        """Return the largest of the shares of a turn that keeps the stop zone free while the robot stands, or brakes.
+
+        Where none does, it is to turn no more.
+        """
+        borders, nearest = self._within_reach(sectors, abs(moving[0]))
+        if self._is_a_disc or omega == 0.0 or not len(nearest):
+            return omega
+        for share in SHARES:
+            places, headings = stopping_paths([0.0], share * omega, moving, self._reacting, self.robot)
+            clearance = self._clearances(places, headings, borders, nearest)[0]
+            if clearance.min() >= self._needed_m(float(clearance[0])):
+                return share * omega
+        return 0.0
+
+    def _needed_m(self, now_m: float) -> float:
+        """Return the clearance that must stay, m, of who has `now_m` of it."""
+        return min(self.margin_m, max(now_m - BLUR_M, LEAST_M), now_m)
 
     def _fastest(
         self,
@@ -216,8 +258,7 @@ class Guard:
         allowed = np.ones(len(SHARES), np.bool_)
         if len(nearest):
             clearance = self._clearances(places, headings, borders, nearest)
-            now = float(clearance[0, 0])
-            allowed = clearance.min(axis=1) >= min(self.margin_m, max(now - BLUR_M, LEAST_M), now)
+            allowed = clearance.min(axis=1) >= self._needed_m(float(clearance[0, 0]))
         if been is not None:
             allowed &= self._has_been(places, been)
         return next((share for share, free in zip(SHARES, allowed.tolist(), strict=True) if free), 0.0)

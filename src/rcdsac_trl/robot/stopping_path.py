@@ -19,6 +19,8 @@ def stopping_paths(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the places that the robot's centre comes by until it stands, itself first, for each wanted speed.
 
+    A robot that is not round has corners that swing: its way ends when it turns no more, either.
+
     Args:
         speeds: wanted linear velocities, m/s.
         omega: wanted angular velocity, rad/s.
@@ -38,7 +40,8 @@ def stopping_paths(
     """
     braking, turning = robot.max_acceleration_m_per_s2, robot.max_angular_acceleration
     driven = [_until_it_stands(speed, moving[0], reacting, braking) for speed in speeds]
-    steps = max(len(of_speed) for of_speed in driven)
+    turned = [] if robot.is_round else _until_it_stands(omega, moving[1], reacting, turning)
+    steps = max(len(of_speed) for of_speed in (*driven, turned))
     covered_m = np.array([of_speed + [0.0] * (steps - len(of_speed)) for of_speed in driven]) * STEP_S
     places = np.zeros((len(speeds), steps + 1, 2))
     on_the_way, headings = _directions(omega, moving[1], reacting, steps, turning)
@@ -47,7 +50,7 @@ def stopping_paths(
 
 
 def _until_it_stands(v: float, now: float, reacting: int, acceleration: float) -> list[float]:
-    """Return the linear velocity in each step: `v` is wanted in the first ones, and to stand from then on."""
+    """Return the velocity in each step, linear or angular: `v` is wanted in the first ones, to stand from then on."""
     speeds: list[float] = []
     while len(speeds) < reacting or abs(now) > STANDS_M_PER_S:
         now = _nearer(v if len(speeds) < reacting else 0.0, now, acceleration * STEP_S)

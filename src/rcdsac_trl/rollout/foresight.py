@@ -1,7 +1,5 @@
 """Agents whose commands act late, told in a simulation what they will meet by then: the same as on a robot."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -12,9 +10,10 @@ from rcdsac_trl.robot.latency import Latency
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.rollout.timed import Timed
 
 
-class ForesightedPolicy(TensorDictModuleBase):
+class ForesightedPolicy(Timed, TensorDictModuleBase):
     """A policy whose agents are told waypoints, velocities and what is remembered as they will be.
 
     Range bins stay as they are.
@@ -42,13 +41,8 @@ class ForesightedPolicy(TensorDictModuleBase):
         self.policy = policy
         self._latencies = [Latency(latency_s, robot) for _ in range(num_agents)]
         self._memories = [RememberedRanges(sensed, memory_s, robot) for _ in range(num_agents)]
-        self._periods_s = [0.0] * num_agents
         self._times_s = [0.0] * num_agents
         self._max_range_m = robot.lidar.max_range_m
-
-    def set_periods(self, periods_s: Sequence[float]) -> None:
-        """Say how long a step of each agent's next episode takes, s."""
-        self._periods_s = list(periods_s)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, acting on what its agents will meet; observations stay as they were."""
@@ -66,7 +60,7 @@ class ForesightedPolicy(TensorDictModuleBase):
         waypoints, moving, remembered = [], [], []
         for row, (latency, memory) in enumerate(zip(self._latencies, self._memories, strict=True)):
             v, omega, *commanded = velocities[row]
-            elapsed_s = 0.0 if begins[row] else self._periods_s[row]
+            elapsed_s = 0.0 if begins[row] else self.periods_s[row]
             if begins[row]:
                 latency.reset()
                 memory.reset()

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import safetensors.torch
 import torch
@@ -21,6 +21,7 @@ from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.robot.compiled_guard import CompiledGuard
+from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.rollout.beta_control import AdaptivePolicy
 from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy
 from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
@@ -35,6 +36,7 @@ from rcdsac_trl.rollout.planners.baselines import baseline_policy
 from rcdsac_trl.rollout.planners.controller import ControllerPolicy
 from rcdsac_trl.rollout.policies import AgentNoise
 from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
+from rcdsac_trl.rollout.timed import Timed
 from rcdsac_trl.rollout.worker import RolloutWorker
 from rcdsac_trl.system import runtime
 from rcdsac_trl.world.maps.generator import Split
@@ -88,12 +90,6 @@ class EvaluationSpec:
     acting: ActingSettings = BY_MEAN
 
 
-class _Timed(Protocol):
-    """A policy that reckons with how long a step takes."""
-
-    def set_periods(self, periods_s: Sequence[float]) -> None: ...
-
-
 class Agent(NamedTuple):
     """A trained agent as bytes, which go from process to process.
 
@@ -137,7 +133,7 @@ def map_evaluator(
             policy = _choosing(spec, policy, loss)
     planner = policy if isinstance(policy, ControllerPolicy) else None
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
-    timed: list[_Timed] = [] if planner is None else [planner]
+    timed: list[Timed] = [] if planner is None else [planner]
     if spec.latency_s:
         policy = _foresighted(spec, policy, len(agent_ids))
         timed.append(policy)
@@ -202,7 +198,8 @@ def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: i
         num_agents,
         boldest=algo.distortion.measure.high if asked.watchdog and algo.context_key == "risk" else None,
         robot=robot,
-        guard=CompiledGuard.of(robot) if asked.stop_zone else None,
+        # As on a robot whose commands act late: it looks so much farther ahead.
+        guard=CompiledGuard.of(robot, reaction_s=Guard.reaction_s + spec.latency_s) if asked.stop_zone else None,
     )
 
 

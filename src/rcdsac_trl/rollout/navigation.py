@@ -1,6 +1,6 @@
 """The navigation around an agent, in a simulation: the same as on a robot, for a whole worker."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors
+from rcdsac_trl.rollout.timed import Timed
 
 
 def navigator_of(
@@ -28,7 +29,7 @@ def navigator_of(
     return Navigator(switched, robot, static_layer)
 
 
-class NavigatedPolicy(TensorDictModuleBase):
+class NavigatedPolicy(Timed, TensorDictModuleBase):
     """A policy whose agents are advised, each by a navigator of its own.
 
     Args:
@@ -59,11 +60,6 @@ class NavigatedPolicy(TensorDictModuleBase):
         self._boldest = boldest
         self._robot = robot
         self._guard = guard
-        self._periods_s = [0.0] * num_agents
-
-    def set_periods(self, periods_s: Sequence[float]) -> None:
-        """Say how long a step of each agent's next episode takes, s."""
-        self._periods_s = list(periods_s)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the policy writes, acting on what the navigators say; observations stay as they were."""
@@ -102,7 +98,7 @@ class NavigatedPolicy(TensorDictModuleBase):
             if begins[row]:
                 navigator.reset()
             (x, y), (x_after, y_after) = waypoints[row]
-            elapsed_s = 0.0 if begins[row] else self._periods_s[row]
+            elapsed_s = 0.0 if begins[row] else self.periods_s[row]
             following = (x, y), (x_after, y_after)
             advice.append(navigator.advise(distances_m[row], self._sensed, following, velocities[row], elapsed_s))
         return advice

@@ -18,6 +18,7 @@ from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
 from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
 from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
+from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
 from rcdsac_trl.rollout.policies import PursuitPolicy
 
 _PLANNERS: Mapping[str, Callable[[RobotSettings], Controller]] = {
@@ -57,8 +58,9 @@ def check_baseline(name: str, sensor: str, robot: RobotSettings = PAPER) -> None
         UserInputError: if there is no such baseline, it cannot be made, or it answers no two velocities.
     """
     policy = baseline_policy(name, sensor=sensor, agent_ids=[0], seed=0, robot=robot)
-    if own_class(name) is None:
+    if not isinstance(policy, ControllerPolicy) or own_class(name) is None:
         return
+    policy.set_periods([PERIOD_S])
     ahead = waypoint_observation(AT_ORIGIN, (5.0, 0.0), (5.0, 0.0))
     seen = {
         "range": torch.zeros(1, NUM_BINS),

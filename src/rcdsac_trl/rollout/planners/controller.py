@@ -14,7 +14,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import range_distances, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
-from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
+from rcdsac_trl.rollout.timed import Timed
 from rcdsac_trl.seeding import stream
 
 
@@ -51,7 +51,7 @@ class Controller(Protocol):
         ...
 
 
-class ControllerPolicy(TensorDictModuleBase):
+class ControllerPolicy(Timed, TensorDictModuleBase):
     """Drives each agent with a controller of its own, so that none depends on which others there are.
 
     Args:
@@ -67,6 +67,7 @@ class ControllerPolicy(TensorDictModuleBase):
         >>> from rcdsac_trl.robot.range_sensor import sensor_mask
         >>> from rcdsac_trl.rollout.planners.dwa import Dwa
         >>> policy = ControllerPolicy(Dwa, "dwa", sensor_mask("narrow"), agent_ids=[0], seed=0)
+        >>> policy.set_periods([0.14])
         >>> ahead = torch.tensor([[1.0, 1.0, 0.0, 1.0, 1.0, 0.0]])
         >>> seen = {"range": torch.zeros(1, 180), "waypoint": ahead, "velocity": torch.zeros(1, 4)}
         >>> begin = torch.ones(1, 1, dtype=torch.bool)
@@ -94,15 +95,10 @@ class ControllerPolicy(TensorDictModuleBase):
         self._seed = seed
         self._map_index = 0
         self._controllers = [make() for _ in self._agent_ids]
-        self._periods_s = [PERIOD_S] * len(self._agent_ids)
 
     def set_map(self, map_index: int) -> None:
         """Choose the random streams of the episodes that begin from now on."""
         self._map_index = map_index
-
-    def set_periods(self, periods_s: Sequence[float]) -> None:
-        """Say how long a step of each agent's next episode takes, s."""
-        self._periods_s = list(periods_s)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`.
@@ -123,7 +119,7 @@ class ControllerPolicy(TensorDictModuleBase):
         for row, controller in enumerate(self._controllers):
             if is_init[row]:
                 noise = stream(self._seed, self._name, self._map_index, self._agent_ids[row])
-                controller.reset(self._sensed, noise, self._periods_s[row])
+                controller.reset(self._sensed, noise, self.periods_s[row])
             actions[row] = self._action(controller.act(ranges_m[row], waypoints_m[row], velocities[row]))
         return tensordict.set("action", torch.from_numpy(actions).view(*tensordict.batch_size, -1))
 
