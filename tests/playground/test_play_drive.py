@@ -11,6 +11,7 @@ from scenes_to_play import drive, offers
 
 from rcdsac_trl.config.play_settings import PlaySettings
 from rcdsac_trl.deploy import Command
+from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.playground.drivers import AgentDriver
@@ -19,6 +20,7 @@ from rcdsac_trl.playground.play_drive import Drive
 from rcdsac_trl.playground.play_session import offers_of
 from rcdsac_trl.playground.scene_choice import SceneChoice
 from rcdsac_trl.playground.view_state import robot_view
+from rcdsac_trl.rollout.planners.mppi import Mppi
 from rcdsac_trl.world.maps.shapes import Box, Map
 from rcdsac_trl.world.office.building import make_office
 from robots import agent
@@ -74,6 +76,29 @@ def test_an_agent_sees_with_the_sensor_that_is_chosen(sensor: str) -> None:
     with driven(3, sensor=sensor, second="dwa") as scene:
         bins = {"narrow": 43, "sparse": 18, "full": 180}[sensor]
         assert [robot.arena.scene().sensor_mask.sum() for robot in scene.robots] == [bins, bins]
+
+
+def test_who_drives_reckons_with_the_control_period_of_its_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    elapsed_s: list[float] = []
+    advise, reset = Navigator.advise, Mppi.reset
+
+    def advised(self: Navigator, *given: Any) -> Advice:
+        elapsed_s.append(given[4])
+        return advise(self, *given)
+
+    def begun(self: Mppi, sensed: Any, rng: Any, period_s: float) -> None:
+        elapsed_s.append(period_s)
+        reset(self, sensed, rng, period_s)
+
+    monkeypatch.setattr(Navigator, "advise", advised)
+    monkeypatch.setattr(Mppi, "reset", begun)
+    periods = set()
+    for seed in "012":
+        elapsed_s.clear()
+        with driven(3, agent="rcdsac_cvar-narrow", second="mppi", detours="on", seed=seed) as scene:
+            assert elapsed_s == pytest.approx([scene.period_s, 0.0, scene.period_s, scene.period_s])
+            periods.add(round(scene.period_s, 2))
+    assert len(periods) > 1
 
 
 def test_a_scene_repeats_and_a_seed_makes_another() -> None:
@@ -267,7 +292,7 @@ def test_an_agent_is_led_around_what_blocks_its_way_and_turned_bold_where_it_sta
         share = 0.8 / math.dist((x, y), (x_1, y_1))
         block = x + share * (x_1 - x), y + share * (y_1 - y)
         scene.put_obstacle(*block)
-        for _ in range(50):  # 7.5 s
+        for _ in range(55):  # 6.6 s
             scene.step()
         assert robot.driver.helped == "it stood still: turned to bold"
         assert (planner.detour, planner.driver.helped) == (None, None)
@@ -294,7 +319,7 @@ def test_nobody_says_that_beta_turned_where_it_did_not(name: str, beta: str) -> 
     query = {"agent": name, "detours": "on"} | ({"beta": beta} if beta else {})
     with driven(0, **query) as scene:
         (robot,) = held(scene).robots
-        for _ in range(50):
+        for _ in range(55):
             scene.step()
         driver = robot.driver
         assert isinstance(driver, AgentDriver)

@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.agent.risk import RiskMeasure, make_measure
-from rcdsac_trl.deploy import Command, Guard, Policy, Sectors, Weights
+from rcdsac_trl.deploy import Command, Guard, Policy, Sectors, Stamps, Weights
 from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller
 from rcdsac_trl.rollout.planners.dwa import Dwa
 from rcdsac_trl.rollout.planners.mppi import Mppi
-from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
 from rcdsac_trl.seeding import stream
 
 NUM_QUANTILES = 16
@@ -109,8 +108,8 @@ class Driver(Protocol):
         """Return the beta by which the measure weighs the return; None where there is none."""
         ...
 
-    def reset(self) -> None:
-        """Begin anew."""
+    def begin(self, period_s: float) -> None:
+        """Begin anew, in a world in which a control period takes so long, s."""
         ...
 
     def act(self, situation: Situation, dialled: float | None) -> Command:
@@ -196,16 +195,19 @@ class AgentDriver:
             return self.fixed_beta
         return self.measure.neutral_beta
 
-    def reset(self) -> None:
-        """Forget everything before."""
+    def begin(self, period_s: float) -> None:
+        """Forget everything before; the agent is told how long a control period takes, s."""
         self.policy.reset()
+        self._period_s, self._periods = period_s, 0
 
     def act(self, situation: Situation, dialled: float | None) -> Command:
         """Return the agent's command."""
         is_weight = self.policy.config.context == "collision_weight"
         beta, weight = (None, dialled) if is_weight else (dialled, None)
         sectors, waypoints, velocity = situation.sectors, situation.waypoints, situation.velocity
-        command = self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight)
+        self._periods += 1
+        now = Stamps(*[self._periods * self._period_s] * 4)
+        command = self.policy.act(sectors, waypoints, velocity, beta, collision_weight=weight, stamps=now)
         self._forget_help()
         if not command.stopped and self.policy.advice is not None:
             self._note(self.policy.advice, (float(waypoints[0, 0]), float(waypoints[0, 1])))
@@ -259,7 +261,6 @@ class PlannerDriver:
         self._mask = robot.sensor_mask(sensor)
         self._guard = Guard.of(robot)
         self._controller: Controller = Dwa(robot=robot) if name == "dwa" else Mppi(robot=robot)
-        self.reset()
 
     def set_detours(self, on: bool) -> None:
         """Do nothing: it navigates by itself."""
@@ -268,9 +269,9 @@ class PlannerDriver:
         """Return None: it knows no return."""
         return None
 
-    def reset(self) -> None:
-        """Forget everything before, its local map too."""
-        self._controller.reset(self._mask, stream(self._seed, self._name, 0, 0), PERIOD_S)
+    def begin(self, period_s: float) -> None:
+        """Forget everything before, its local map too; the planner is told how long a control period takes, s."""
+        self._controller.reset(self._mask, stream(self._seed, self._name, 0, 0), period_s)
 
     def act(self, situation: Situation, dialled: float | None) -> Command:
         """Return the planner's command."""

@@ -63,7 +63,8 @@ class Robot:
     detour: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Begin the trail where the robot starts."""
+        """Begin the drive, and the trail where the robot starts."""
+        self.driver.begin(self.arena.period_s)
         x, y, _ = self.arena.simulation.pose
         self.trail.append((x, y, 0.0))
 
