@@ -44,14 +44,6 @@ NAVIGATION = {
         "your-building",
         "your-robot",
     ],
-    "Reference": [
-        "run-folder",
-        "reference/commands",
-        "reference/configuration",
-        *api_reference.PAGES,
-        "reference/changelog",
-    ],
-    "Explanation": ["agent", "world", "differences", "study", "off-the-maps", "speed"],
     "Results": [
         "results",
         "results-paper",
@@ -61,6 +53,14 @@ NAVIGATION = {
         "results-calibration",
         "results-earlier",
     ],
+    "Reference": [
+        "run-folder",
+        "reference/commands",
+        "reference/configuration",
+        *api_reference.PAGES,
+        "reference/changelog",
+    ],
+    "Explanation": ["agent", "world", "differences", "study", "off-the-maps", "speed"],
 }
 
 project = "rcdsac_trl"
