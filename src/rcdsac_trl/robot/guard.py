@@ -224,8 +224,10 @@ class Guard:
 
         Where none does, it is to turn no more.
         """
+        if self._is_a_disc or omega == 0.0:
+            return omega
         borders, nearest = self._within_reach(sectors, abs(moving[0]))
-        if self._is_a_disc or omega == 0.0 or not len(nearest):
+        if not len(nearest):
             return omega
         for share in SHARES:
             places, headings = stopping_paths([0.0], share * omega, moving, self._reacting, self.robot)
