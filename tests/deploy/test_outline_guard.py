@@ -47,6 +47,10 @@ def test_why_it_does_not_turn_is_told() -> None:
     assert Guard.of(CAR).limit(0.0, 0.5, beside(0.5)) == (0.0, 0.5, None)
     assert Guard.of(CAR).limit(0.0, 1.5, beside(0.26), (0.0, 1.0)) == (0.0, 0.0, "the stop zone")
     assert Guard.of(PAPER).limit(0.0, 1.5, beside(0.26), (0.0, 1.0)) == (0.0, 1.5, None)
+    # Whatever circle is given, its corners are 0.32 m away.
+    limited = Guard.of(CAR).limit(0.0, 1.5, beside(0.31), (0.0, 1.0))
+    assert limited[2] == "the stop zone"
+    assert Guard.of(CAR, radius_m=0.2).limit(0.0, 1.5, beside(0.31), (0.0, 1.0)) == limited
 
 
 def test_it_turns_to_a_way_on_the_side_on_which_its_corners_get_past() -> None:

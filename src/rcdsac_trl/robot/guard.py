@@ -313,9 +313,8 @@ class Guard:
 
     def _reach(self, speed: float) -> float:
         """Return how near to here, m, something must be to matter to who is never faster than `speed`."""
-        return (
-            self.radius_m + self.margin_m + speed * (self.reaction_s + STEP_S) + self.robot.stopping_distance_m(speed)
-        )
+        held_m = self.radius_m if self._is_a_disc else self.robot.circumradius_m  # corners reach so far
+        return held_m + self.margin_m + speed * (self.reaction_s + STEP_S) + self.robot.stopping_distance_m(speed)
 
 
 def _check_robot(robot: object) -> None:
