@@ -389,11 +389,17 @@ def scenes_of(agent_ids: list[int]) -> list[Scene]:
     return [Scene(circles=[(1.0 + 0.2 * agent, 0.1, 0.2)]) for agent in agent_ids]
 
 
-def actions(name: str, agent_ids: list[int], *, seed: int = 0, map_index: int = 0, steps: int = 4) -> NDArray:
-    """Return what a baseline does with some agents, [steps, agents, 2]."""
+def told(name: str, agent_ids: list[int], seed: int = 0) -> ControllerPolicy:
+    """Return the policy of a planner that is told how long a step takes."""
     policy = baseline_policy(name, sensor="narrow", agent_ids=agent_ids, seed=seed)
     assert isinstance(policy, ControllerPolicy)
     policy.set_periods([PERIOD_S] * len(agent_ids))
+    return policy
+
+
+def actions(name: str, agent_ids: list[int], *, seed: int = 0, map_index: int = 0, steps: int = 4) -> NDArray:
+    """Return what a baseline does with some agents, [steps, agents, 2]."""
+    policy = told(name, agent_ids, seed)
     policy.set_map(map_index)
     scenes = scenes_of(agent_ids)
     return np.stack([policy(observations(scenes, step == 0))["action"].numpy() for step in range(steps)])
@@ -410,9 +416,7 @@ def test_the_same_seed_gives_the_same_actions_whoever_else_there_is(name: str) -
 
 
 def test_noise_derives_from_seed_map_and_agent() -> None:
-    policy = baseline_policy("mppi", sensor="narrow", agent_ids=[0, 1], seed=0)
-    assert isinstance(policy, ControllerPolicy)
-    policy.set_periods([PERIOD_S, PERIOD_S])
+    policy = told("mppi", [0, 1])
     same = scenes_of([0, 0])
     first = policy(observations(same, True))["action"]
     assert not torch.equal(first[0], first[1])
@@ -423,9 +427,7 @@ def test_noise_derives_from_seed_map_and_agent() -> None:
 
 @pytest.mark.parametrize("name", ["dwa", "mppi"])
 def test_an_agent_that_begins_forgets_and_the_others_do_not(name: str) -> None:
-    policy = baseline_policy(name, sensor="narrow", agent_ids=[0, 1], seed=0)
-    assert isinstance(policy, ControllerPolicy)
-    policy.set_periods([PERIOD_S, PERIOD_S])
+    policy = told(name, [0, 1])
     scenes = scenes_of([0, 1])
     first = policy(observations(scenes, True))["action"].clone()
     second = policy(observations(scenes, False))["action"].clone()

@@ -185,5 +185,4 @@ class EvaluationSettings:
         Raises:
             UserInputError: as :func:`~rcdsac_trl.config.chosen_world.chosen_world`.
         """
-        chosen = {"maps": self.map, "sensor": self.sensor, "task": self.task, "robot": self.robot}
-        return chosen_world(trained, self.run, **chosen)
+        return chosen_world(trained, self.run, maps=self.map, sensor=self.sensor, task=self.task, robot=self.robot)

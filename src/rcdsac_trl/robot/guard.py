@@ -132,6 +132,11 @@ class Guard:
         }
         return cls(**{**limits, **changes, "robot": robot})
 
+    @classmethod
+    def of_late(cls, robot: RobotSettings, latency_s: float) -> "Guard":
+        """Return the guard of a robot whose commands act so late, s: it looks so much farther ahead."""
+        return cls.of(robot, reaction_s=cls.reaction_s + latency_s)
+
     def limit(
         self,
         v: float,

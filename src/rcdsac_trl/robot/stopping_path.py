@@ -40,11 +40,11 @@ def stopping_paths(
     """
     braking, turning = robot.max_acceleration_m_per_s2, robot.max_angular_acceleration
     driven = [_until_it_stands(speed, moving[0], reacting, braking) for speed in speeds]
-    turned = [] if robot.is_round else _until_it_stands(omega, moving[1], reacting, turning)
-    steps = max(len(of_speed) for of_speed in (*driven, turned))
+    turned = _until_it_stands(omega, moving[1], reacting, turning)
+    steps = max(len(of_speed) for of_speed in (driven if robot.is_round else [*driven, turned]))
     covered_m = np.array([of_speed + [0.0] * (steps - len(of_speed)) for of_speed in driven]) * STEP_S
     places = np.zeros((len(speeds), steps + 1, 2))
-    on_the_way, headings = _directions(omega, moving[1], reacting, steps, turning)
+    on_the_way, headings = _directions((turned + [0.0] * steps)[:steps])
     np.cumsum(covered_m[:, :, None] * on_the_way, axis=1, out=places[:, 1:])
     return places, headings
 
@@ -58,17 +58,15 @@ def _until_it_stands(v: float, now: float, reacting: int, acceleration: float) -
     return speeds
 
 
-def _directions(
-    omega: float, now: float, reacting: int, steps: int, acceleration: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _directions(turned: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return directions as cosine and sine: the mean one in each step, [steps, 2], and at its ends, [steps + 1, 2].
 
-    See :func:`_until_it_stands`.
+    Args:
+        turned: angular velocity in each step, rad/s.
     """
     yaw, directions, headings = 0.0, [], [(1.0, 0.0)]
-    for step in range(steps):
-        now = _nearer(omega if step < reacting else 0.0, now, acceleration * STEP_S)
-        half = now * STEP_S / 2.0
+    for omega in turned:
+        half = omega * STEP_S / 2.0
         directions.append((math.cos(yaw + half), math.sin(yaw + half)))
         yaw += 2.0 * half
         headings.append((math.cos(yaw), math.sin(yaw)))

@@ -21,7 +21,6 @@ from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
 from rcdsac_trl.deploy.policy.acting import BY_MEAN, ActingSettings
 from rcdsac_trl.deploy.policy.beta_controllers import BetaController, ClearanceBeta, FixedBeta, TailVarianceBeta
 from rcdsac_trl.robot.compiled_guard import CompiledGuard
-from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.rollout.beta_control import AdaptivePolicy
 from rcdsac_trl.rollout.choosing_policy import ChoosingPolicy
 from rcdsac_trl.rollout.collisions import COLLISIONS, CollisionRecorder
@@ -198,8 +197,7 @@ def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: i
         num_agents,
         boldest=algo.distortion.measure.high if asked.watchdog and algo.context_key == "risk" else None,
         robot=robot,
-        # As on a robot whose commands act late: it looks so much farther ahead.
-        guard=CompiledGuard.of(robot, reaction_s=Guard.reaction_s + spec.latency_s) if asked.stop_zone else None,
+        guard=CompiledGuard.of_late(robot, spec.latency_s) if asked.stop_zone else None,
     )
 
 

@@ -46,7 +46,7 @@ def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None, late
         UserInputError: if the one that was given is another robot's.
     """
     if guard == "robot":
-        return Guard.of(robot, reaction_s=Guard.reaction_s + latency_s)
+        return Guard.of_late(robot, latency_s)
     if not isinstance(guard, Guard | None):
         raise UserInputError(f"guard={guard!r} is none: give Guard.of(robot), None to drive without, or leave it out")
     if guard is not None and guard.robot != robot:
