@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from motors import driven
 
 from rcdsac_trl.deploy import Guard, PathFollower, Sectors
 from rcdsac_trl.errors import UserInputError
@@ -106,10 +107,8 @@ def test_it_gets_around_a_post_that_it_would_stand_before() -> None:
             wish = 0.4 * max(0.2, math.cos(bearing)), max(-1.5, min(1.5, 2.0 * bearing))
             seen = Sectors(sector_distances(x, y, yaw, NO_SEGMENTS, circles), ALL)
             command = guard.limit(*wish, seen, (v, omega))[:2]
-            for _ in range(7):
-                v, omega = clip_command(*command, v, omega)
-                yaw += omega * 0.02
-                x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
+            poses, (v, omega) = driven(command, (x, y, yaw), (v, omega))
+            x, y, yaw = poses[-1]
             assert free_distance(x, y, NO_SEGMENTS, circles) > guard.radius_m
             nearest = min(nearest, math.dist((x, y), (2.5, 0.0)))
         return nearest
@@ -177,11 +176,9 @@ def test_no_command_drives_into_what_is_sensed(seed: int) -> None:
             wanted = float(rng.choice([0.6, 0.6, -0.2, rng.uniform(-0.2, 0.6)])), float(rng.uniform(-1.57, 1.57))
         seen = Sectors(sector_distances(x, y, yaw, segments, circles), ALL)
         command = guard.limit(*wanted, seen, (v, omega))[:2]
-        for _ in range(7):
-            v, omega = clip_command(*command, v, omega)
-            yaw += omega * 0.02
-            x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
-            assert free_distance(x, y, segments, circles) > guard.radius_m
+        poses, (v, omega) = driven(command, (x, y, yaw), (v, omega))
+        x, y, yaw = poses[-1]
+        assert min(free_distance(*pose[:2], segments, circles) for pose in poses) > guard.radius_m
 
 
 def plain_limit(guard: Guard, v: float, sectors: Sectors, omega: float, moving: tuple[float, float]) -> float:

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from motors import driven
 
 from rcdsac_trl.deploy import Guard, Sectors
-from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.world.maps.geometry import outline_clearance
+from rcdsac_trl.world.maps.shapes import Box, Cylinder, Map
 from rcdsac_trl.world.sim.lidar import sector_distances
 
 ALL = np.ones(180, dtype=np.bool_)
@@ -30,9 +31,8 @@ def turned_on_the_spot(y: float) -> float:
     yaw = omega = 0.0
     for _ in range(120):
         _, turn, _ = Guard.of(CAR).limit(0.0, 0.6, beside(y, yaw), (0.0, omega))
-        for _ in range(7):
-            _, omega = clip_command(0.0, turn, 0.0, omega, 0.02, CAR)
-            yaw += omega * 0.02
+        poses, (_, omega) = driven((0.0, turn), (0.0, 0.0, yaw), (0.0, omega), CAR)
+        yaw = poses[-1][2]
     return yaw
 
 
@@ -65,17 +65,12 @@ def test_it_turns_to_a_way_on_the_side_on_which_its_corners_get_past() -> None:
     assert turns[1] < 0.0
 
 
-def boxes(rng: np.random.Generator, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw boxes as geometry has them, [n, 6], and their sides, [4 n, 4]."""
-    middles, halves = rng.uniform(-2.5, 2.5, (number, 2)), rng.uniform(0.05, 0.8, (number, 2))
-    angles = rng.uniform(0.0, math.pi, number)
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    sides = []
-    for middle, (along, across), (cos, sin) in zip(middles, halves, directions, strict=True):
-        corners = np.array([(along, across), (-along, across), (-along, -across), (along, -across)])
-        corners = corners @ np.array([[cos, sin], [-sin, cos]]) + middle
-        sides.extend(np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1))
-    return np.concatenate([middles, halves, directions], axis=1), np.array(sides)
+def scene(rng: np.random.Generator) -> Map:
+    """Draw boxes and round things around the origin."""
+    angles, halves = rng.uniform(0.0, math.pi, 4), rng.uniform(0.05, 0.8, (4, 2))
+    boxes = [Box(*rng.uniform(-2.5, 2.5, 2), *half, yaw, mapped=True) for half, yaw in zip(halves, angles, strict=True)]
+    discs = [Cylinder(*rng.uniform(-2.5, 2.5, 2), rng.uniform(0.02, 0.3), mapped=True) for _ in range(8)]
+    return Map("clutter", 10.0, tuple(boxes), tuple(discs), ())
 
 
 @pytest.mark.parametrize("robot", [CAR, LONG])
@@ -83,11 +78,13 @@ def boxes(rng: np.random.Generator, number: int) -> tuple[np.ndarray, np.ndarray
 @given(st.integers(0, 2**32 - 1))
 def test_no_command_drives_or_turns_into_what_is_sensed(robot: RobotSettings, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    solid, segments = boxes(rng, 4)
-    circles = np.column_stack([rng.uniform(-2.5, 2.5, (8, 2)), rng.uniform(0.02, 0.3, 8)])
+    around_it = scene(rng)
+    segments, (solid, circles) = around_it.segments(), around_it.solids()
     guard = Guard.of(robot)
-    around = np.array([math.dist((x, y), (0.0, 0.0)) - radius for x, y, radius in circles])
-    if outline_clearance(robot.outline, (0.0, 0.0, 0.0), solid, circles, 2.0) < guard.margin_m or around.min() < 0.2:
+    middles = np.concatenate([solid[:, :2], circles[:, :2]])
+    inside = (middles > robot.outline.min(0)).all(1) & (middles < robot.outline.max(0)).all(1)
+    # Nothing may begin within the margin, nor wholly inside the robot.
+    if outline_clearance(robot.outline, (0.0, 0.0, 0.0), solid, circles, 2.0) < guard.margin_m or inside.any():
         return
     x = y = yaw = v = omega = 0.0
     wanted = (0.0, 0.0)
@@ -96,8 +93,6 @@ def test_no_command_drives_or_turns_into_what_is_sensed(robot: RobotSettings, se
             wanted = float(rng.choice([0.6, 0.0, -0.2, rng.uniform(-0.2, 0.6)])), float(rng.uniform(-1.57, 1.57))
         seen = Sectors(sector_distances(x, y, yaw, segments, circles), ALL)
         command = guard.limit(*wanted, seen, (v, omega))[:2]
-        for _ in range(7):
-            v, omega = clip_command(*command, v, omega, 0.02, robot)
-            yaw += omega * 0.02
-            x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
-            assert outline_clearance(robot.outline, (x, y, yaw), solid, circles, 2.0) > 0.0
+        poses, (v, omega) = driven(command, (x, y, yaw), (v, omega), robot)
+        x, y, yaw = poses[-1]
+        assert min(outline_clearance(robot.outline, pose, solid, circles, 2.0) for pose in poses) > 0.0
