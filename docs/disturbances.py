@@ -6,6 +6,8 @@ What a name has done already at that size, in ``build/disturbances``, is not dri
     python docs/disturbances.py --name rcdsac_cvar-narrow run=rcdsac_cvar-narrow beta=[0.25]
     python docs/disturbances.py --name mppi baseline=mppi
     make tables
+
+With ``--tell-latency`` an agent is told how late its commands act where they are delayed, as a robot's can be.
 """
 
 import argparse
@@ -31,6 +33,9 @@ DISTURBANCES: Mapping[str, tuple[str, ...]] = {
 }
 """Name to overrides of the evaluation's config."""
 
+LATENCY_S: Mapping[str, float] = {"delay: one period": 0.14, "delay: two periods": 0.28}
+"""What an agent can be told of a disturbance, s: so many mean control periods."""
+
 COLUMNS = ("map", "episode", "collisions", "reward")
 """What is kept of an episode, besides the disturbance."""
 
@@ -41,6 +46,7 @@ def main() -> None:
     parser.add_argument("--name", required=True, help="of the file in results/disturbances, and in the table")
     parser.add_argument("--maps", type=int, default=20, help="evaluation maps (default: %(default)s)")
     parser.add_argument("--episodes", type=int, default=5, help="on each of them (default: %(default)s)")
+    parser.add_argument("--tell-latency", action="store_true", help="delayed commands: the agent knows it")
     parser.add_argument("overrides", nargs="+", help="whom evaluate drives: run=<agent> beta=[<one>], baseline=<name>")
     options = parser.parse_args()
     done = ROOT / "build" / "disturbances" / f"{options.name}-{options.maps}x{options.episodes}"
@@ -48,6 +54,8 @@ def main() -> None:
     for number, (disturbance, changes) in enumerate(DISTURBANCES.items()):
         folder = done / str(number)
         if not (folder / "episodes.csv").is_file():
+            if options.tell_latency and disturbance in LATENCY_S:
+                changes = (*changes, f"latency_s={LATENCY_S[disturbance]}")
             sizes = f"num_maps={options.maps}", f"num_episodes={options.episodes}", f"out={folder}"
             make_evaluation(compose("evaluate", [*options.overrides, *changes, *sizes])).run()
         episodes = pd.read_csv(folder / "episodes.csv")[list(COLUMNS)]
