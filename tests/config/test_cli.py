@@ -119,6 +119,10 @@ def refusal(
         ([POW, "learner.gamma=1"], "learner.gamma=1 is outside [0, 1)"),
         ([POW, "learner.target_coefficient=0"], "learner.target_coefficient=0 is outside (0, 1]"),
         ([POW, "learner.num_critics=3"], "learner.num_critics=3 is neither 1 nor 2"),
+        (
+            [POW, "learner.resample_per=transition", "learner.n_steps=3"],
+            "learner.n_steps=3 sums rewards over transitions of one beta",
+        ),
         ([POW, "learner.resample_per=step"], "learner.resample_per=step must be one of transition, sequence"),
         ([POW, "learner=5"], "learner=5 must be a section with keys of its own"),
         ([POW, "seed=1.5"], "seed=1.5 must be a whole number"),
@@ -333,12 +337,21 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
             [RUN, "beta=[-2,-1]", "controller.near_m=2"],
             "controller.near_m=2 must be above 0 and below controller.far_m=1.2",
         ),
+        (
+            [RUN, "beta=[-2,-1]", "beta_controller=[clearance]", "controller.near_m=3.5", "controller.far_m=4"],
+            "controller.near_m=3.5 is beyond the 3 m that agents see: lower it",
+        ),
         ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
         (["baseline=random"], "baseline=random is unknown: choose one of pursuit, dwa, mppi, or <module>:<class>"),
         (["baseline=3"], "baseline=3 must be text or null"),
         (
             ["baseline=pursuit", "beta_controller=[clearance]"],
             "baseline=pursuit has no beta to turn: leave",
+        ),
+        (["baseline=pursuit", "checkpoint=last"], "baseline=pursuit has no checkpoints: leave checkpoint out"),
+        (
+            [RUN, "acting.num_candidates=1", "acting.spread=0.5"],
+            "acting.spread=0.5 says how critics choose, and with acting.num_candidates=1 they do not: leave it out",
         ),
         (["baseline=pursuit", "beta=[-1]"], "baseline=pursuit has neither beta nor collision weight: leave them out"),
     ],

@@ -1,6 +1,7 @@
 """Speed limit and stop zone: closed forms on plain scenes, and no collision in any scene, whatever is commanded."""
 
 import math
+from collections import deque
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,8 @@ from rcdsac_trl.deploy import Guard, PathFollower, Sectors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.compiled_guard import CompiledGuard
+from rcdsac_trl.robot.latency import Ahead, Latency
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.world.sim.lidar import sector_distances
 from robots import agent
 
@@ -179,6 +182,51 @@ def test_no_command_drives_into_what_is_sensed(seed: int) -> None:
         poses, (v, omega) = driven(command, (x, y, yaw), (v, omega))
         x, y, yaw = poses[-1]
         assert min(free_distance(*pose[:2], segments, circles) for pose in poses) > guard.radius_m
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.14, 0.2, 0.28, 0.5]))
+def test_no_command_that_acts_late_drives_into_what_is_sensed(seed: int, latency_s: float) -> None:
+    rng = np.random.default_rng(seed)
+    segments = rng.uniform(-3, 3, (6, 4))
+    circles = np.column_stack([rng.uniform(-3, 3, (10, 2)), rng.uniform(0.02, 0.3, 10)])
+    guard, latency = Guard(), Latency(latency_s)
+    if free_distance(0.0, 0.0, segments, circles) < guard.radius_m + guard.margin_m:
+        return
+    x = y = yaw = v = omega = 0.0
+    wanted = (0.0, 0.0)
+    under_way = deque([wanted] * round(latency_s / 0.02))
+    for step in range(120):
+        if step % 5 == 0:
+            wanted = float(rng.choice([0.6, 0.6, -0.2, rng.uniform(-0.2, 0.6)])), float(rng.uniform(-1.57, 1.57))
+        seen = Sectors(sector_distances(x, y, yaw, segments, circles), ALL)
+        ahead = latency.ahead((v, omega), 0.14 * step)
+        command = guard.limit(*wanted, seen, (v, omega), None, ahead)[:2]
+        latency.note(command, 0.14 * step)
+        for _ in range(7):
+            under_way.append(command)
+            v, omega = clip_command(*under_way.popleft(), v, omega)
+            yaw += omega * 0.02
+            x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
+            assert free_distance(x, y, segments, circles) > guard.radius_m
+
+
+def test_a_command_is_limited_from_where_the_robot_will_be() -> None:
+    """It brakes as late as if it stood there, and turned as it will be, already: a disc, a rectangle, compiled, too."""
+    cart = replace(PAPER, shape="rectangle", corners=None, radius_m=None, length_m=0.6, width_m=0.4)
+    pose = (0.4, -0.1, 0.3)
+    walls = np.array([[0.9, -9.0, 0.9, 9.0], [-9.0, -0.75, 9.0, -0.75]])
+    there = Sectors(sector_distances(*pose, walls, NO_CIRCLES), ALL)
+    here = Sectors(sector_distances(0.0, 0.0, 0.0, walls, NO_CIRCLES), ALL)
+    for robot in (PAPER, cart):
+        limited = set()
+        for kind in (Guard, CompiledGuard):
+            guard = kind.of(robot, evade=False)
+            for v, omega in ((0.6, 0.0), (0.3, -1.0), (0.6, 1.0), (0.1, -1.5)):
+                found = guard.limit(v, omega, here, (0.5, 0.0), None, Ahead(pose, (0.4, 0.2), 0.28))
+                assert found == guard.limit(v, omega, there, (0.4, 0.2))
+                limited.add(found[2])
+        assert limited == {None, "the stop zone"}
 
 
 def plain_limit(guard: Guard, v: float, sectors: Sectors, omega: float, moving: tuple[float, float]) -> float:

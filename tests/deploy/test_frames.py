@@ -12,7 +12,7 @@ from test_robot_driver import Recorder, cloud, header, laser, odometry, path
 
 from rcdsac_trl.deploy import CameraPose, Mount, Policy, scan_sectors
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
-from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
+from rcdsac_trl.deploy.frames.robot_frames import FrameSettings, RobotFrames
 from rcdsac_trl.deploy.frames.sensor_mounts import mount_of, transform_of_mount
 from rcdsac_trl.deploy.frames.transform_buffer import ALWAYS_S, TransformBuffer, TransformError
 from rcdsac_trl.deploy.policy.driver import Driver
@@ -345,6 +345,20 @@ def test_odometry_whose_clock_is_set_back_is_the_newest_all_the_same() -> None:
         found.on_scan(laser(now))
         found.command(now)
     assert policy.waypoints[0] == pytest.approx([7.0, 0.0])
+
+
+@pytest.mark.parametrize("back_s", [2.0, 500.0])
+def test_a_pose_of_before_the_clock_was_set_back_counts_no_more(back_s: float) -> None:
+    frames = RobotFrames(FrameSettings(localisation="pose"))
+    frames.moved("odom", "base_link", 1000.0, (1.0, 0.0, 0.0))
+    frames.localised("map", 1000.0, (5.0, 0.0, 0.0))
+    assert frames.robot_in("map", 1000.0)[0] == (5.0, 0.0, 0.0)
+    now_s = 1000.0 - back_s
+    frames.moved("odom", "base_link", now_s, (1.0, 0.0, 0.0))
+    with pytest.raises(TransformError, match="no pose of the robot has come yet"):
+        frames.robot_in("map", now_s)
+    frames.localised("map", now_s, (50.0, 0.0, 0.0))
+    assert frames.robot_in("map", now_s)[0] == (50.0, 0.0, 0.0)
 
 
 def test_broken_transforms_are_left_out_and_told_where_they_are_missed() -> None:

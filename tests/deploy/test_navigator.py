@@ -143,7 +143,7 @@ def test_what_is_out_of_view_is_told_to_the_stop_zone() -> None:
         ranges = np.where(NARROW, seen((x, 0.0, 0.0), beside), np.inf)
         # From rest, reckoned along the mean of two velocities: it is given the same one from the first call on.
         advice = navigator.advise(ranges, NARROW, GOAL, (0.5, 0.0), 0.14 if step else 0.0)
-    known_m = navigator.known(Sectors(ranges, NARROW), None).distances_m
+    known_m = navigator.known(Sectors(ranges, NARROW), None, 1.5).distances_m
     there = known_m[44:46]  # 88 to 92 degrees, where no sector sees
     assert np.isfinite(there).any()
     assert there.min() == pytest.approx(0.5, abs=0.06)
@@ -159,14 +159,14 @@ def test_who_has_just_walked_out_of_view_is_told_to_the_stop_zone_where_it_is_by
         ranges = np.where(NARROW, sector_distances(0.0, 0.0, 0.0, np.empty((0, 4)), person), np.inf)
         navigator.advise(ranges, NARROW, GOAL, (0.0, 0.0), 0.14 if step else 0.0)
     assert np.isinf(ranges).all()
-    known_m = navigator.known(Sectors(ranges, NARROW), None).distances_m
+    known_m = navigator.known(Sectors(ranges, NARROW), None, 1.5).distances_m
     distance_m, bearing = math.hypot(0.8, y), math.degrees(math.atan2(y, 0.8))
     assert known_m.min() == pytest.approx(distance_m - 0.25, abs=0.08)
     told = np.flatnonzero(np.isfinite(known_m))
     assert 2.0 * told.mean() == pytest.approx(bearing, abs=4.0)
     for _ in range(20):  # by then it has turned, for all that is known
         navigator.advise(ranges, NARROW, GOAL, (0.0, 0.0), 0.14)
-    assert np.isinf(navigator.known(Sectors(ranges, NARROW), None).distances_m).all()
+    assert np.isinf(navigator.known(Sectors(ranges, NARROW), None, 1.5).distances_m).all()
 
 
 # ------------------------------------------------------------------------------------------------ standstill

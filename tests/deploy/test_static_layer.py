@@ -3,6 +3,8 @@
 import copy
 import math
 from array import array
+from collections import deque
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +14,7 @@ from test_frames import tf
 from test_navigator import ALL, AT_ONCE, in_robot, seen
 from test_robot_driver import header, laser, odometry, path
 
-from rcdsac_trl.deploy import Policy
+from rcdsac_trl.deploy import Guard, Policy
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
 from rcdsac_trl.deploy.navigation.detour import plan_detour
 from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings, clearances_around
@@ -22,6 +24,9 @@ from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.ros.messages import static_layer_of
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import clip_command
+from rcdsac_trl.robot.latency import Latency
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.robot.sectors import Mount, Sectors
 from robots import AHEAD, OPEN, STANDING, agent
 
@@ -107,18 +112,40 @@ def test_a_detour_keeps_clear_of_a_pane_that_only_the_map_shows() -> None:
     advice = navigator.advise(OPEN, ALL, goal, (0.0, 0.0), 0.0, pose)
     corner = advice.waypoints[0]
     assert corner[1] < -0.8 - 0.2
-    # 1.5 m and farther: no stop zone reaches there.
-    assert navigator.known(Sectors(OPEN, ALL), pose).distances_m[0] == math.inf
+    # What is farther away than a stop zone reaches is left out.
+    assert navigator.known(Sectors(OPEN, ALL), pose, 1.0).distances_m[0] == math.inf
+    assert navigator.known(Sectors(OPEN, ALL), pose, 2.8).distances_m[0] < 2.0
     assert navigator.advise(OPEN, ALL, goal, (0.0, 0.0), 0.14).waypoints == goal  # nobody says where it is
 
 
 def test_the_stop_zone_minds_a_pane_in_a_sector_that_sees_through_it() -> None:
     navigator = Navigator(AT_ONCE, static_layer=StaticLayer.of_shapes(PANE))
-    known_m = navigator.known(Sectors(OPEN, ALL), (0.7, 0.0, 0.0)).distances_m
+    known_m = navigator.known(Sectors(OPEN, ALL), (0.7, 0.0, 0.0), 1.5).distances_m
     exact = seen((0.7, 0.0, 0.0), PANE)
     near = exact < 1.4
     assert near.sum() > 40
     assert known_m[near] == pytest.approx(exact[near], abs=0.02)
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.28])
+def test_a_fast_robot_stands_before_a_pane_that_only_the_map_shows(latency_s: float) -> None:
+    """At 2 m/s its stop zone looks 2 m and farther."""
+    robot = replace(PAPER, max_speed_m_per_s=2.0)
+    navigator = Navigator(AT_ONCE, robot, StaticLayer.of_shapes(np.array([[6.0, -5.0, 6.0, 5.0]])))
+    guard, latency = Guard.of(robot), Latency(latency_s, robot)
+    x = v = 0.0
+    under_way = deque([(0.0, 0.0)] * round(latency_s / 0.02))
+    for step in range(50):
+        ahead = latency.ahead((v, 0.0), 0.14 * step)
+        known = navigator.known(Sectors(OPEN, ALL), (x, 0.0, 0.0), guard.reach_m(2.0, ahead))
+        command = guard.limit(2.0, 0.0, known, (v, 0.0), None, ahead)[0], 0.0
+        latency.note(command, 0.14 * step)
+        for _ in range(7):
+            under_way.append(command)
+            v, _ = clip_command(*under_way.popleft(), v, 0.0, 0.02, robot)
+            x += 0.02 * v
+    assert v == 0.0
+    assert 0.04 < 6.0 - x - guard.radius_m < 0.12
 
 
 def follow(walls: np.ndarray, start: tuple[float, float], goal: tuple[float, float]) -> list[tuple[float, float]]:

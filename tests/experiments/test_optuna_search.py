@@ -120,6 +120,39 @@ def test_a_killed_search_goes_on_with_the_trial_that_was_lost(trained: Callable)
     made("search.trials=3").run()  # nothing is left to do
 
 
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        (["learner.batch_size=8"], r"has trials with learner\.batch_size not given, and now it is 8: ask for the same"),
+        (
+            ["learner.gamma=interval(0.1,0.9)"],
+            r"learner\.gamma interval\(0\.5,0\.9\), and now it is interval\(0\.1,0\.9\)",
+        ),
+        (["learner.gamma=choice(0.5,0.9)"], r"now it is choice\(0\.5,0\.9\)"),
+        (["search.collision_cost=20"], r"search\.collision_cost 10, and now it is 20"),
+    ],
+)
+def test_a_search_does_not_go_on_as_another_one(trained: Callable, changed: list[str], told: str) -> None:
+    jobs = trained(GOOD, GOOD)
+    made("search.trials=1").run()
+    with pytest.raises(UserInputError, match=told):
+        made("search.trials=2", *changed).run()
+    assert len(jobs) == 1
+    made("search.trials=2", "search.startup_trials=1").run()  # which changes no trial's worth
+    assert len(jobs) == 2
+
+
+def test_searches_side_by_side_propose_different_trials(trained: Callable) -> None:
+    trained()
+    one, other = made(), made()
+    assert not one.study.trials
+    assert not other.study.trials
+    asked = [search._ask() for search in (one, other, one, other)]
+    gammas = [trial.suggest_float("learner.gamma", 0.5, 0.9) for trial in asked]
+    assert [trial.number for trial in asked] == [0, 1, 2, 3]
+    assert len(set(gammas)) == 4
+
+
 def test_a_search_whose_journal_was_cut_goes_on(trained: Callable, capsys: pytest.CaptureFixture) -> None:
     """The disk filled up while the first trial's end was written: that trial is taken up again."""
     jobs = trained(GOOD)

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,9 @@ def test_what_is_published_tells_recalibrated_quantiles_and_drives_as_before(run
     assert (told.recalibrated, raw.recalibrated) == (True, False)
     expected = fit_recalibration(folder_of(run, "validation"), "rcdsac_pow-narrow")
     assert told.config.recalibration == expected
+    agent = named_agent(published)  # as films and calibrations take it
+    assert agent.recalibration(told.acting) == expected
+    assert agent.recalibration(replace(told.acting, num_candidates=told.acting.num_candidates + 1)) is None
     command = told.act(OPEN, AHEAD, STANDING, -1.5)
     between = np.mean(expected.offsets, axis=0)
     assert command.quantiles == pytest.approx(np.sort(command.raw_quantiles + between), abs=1e-4)

@@ -20,6 +20,7 @@ from rcdsac_trl.report.evaluation_summary import summarised
 from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.learning_figures import learning_curves
 from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.read_course import read_courses
 from rcdsac_trl.report.response_figures import beta_response
 from rcdsac_trl.report.results import Results
 from rcdsac_trl.report.write import write_report
@@ -219,6 +220,17 @@ def test_seeds_of_an_agent_that_act_differently_are_not_averaged(tmp_path: Path)
         read_episodes([before, late])
     other = evaluate(tmp_path / "other", "rcwr", {NONE: 2})  # another agent may
     assert len(read_episodes([chooses, other]).conditions) == 2
+
+
+def test_seeds_of_an_agent_that_have_other_risk_measures_are_not_averaged(tmp_path: Path) -> None:
+    power = evaluate(tmp_path / "power", "rcdsac_pow", {-1.0: 0}, measure="pow")
+    wang = evaluate(tmp_path / "wang", "rcdsac_pow", {-1.0: 2}, train_seed=1, measure="wang")
+    with pytest.raises(
+        UserInputError, match=r"rcdsac_pow, with the risk measures pow and wang: train .* \(algo\.name\)"
+    ):
+        read_episodes([power, wang])
+    again = evaluate(tmp_path / "again", "rcdsac_pow", {-1.0: 2}, train_seed=2, measure="pow")
+    assert len(read_episodes([power, again]).conditions) == 1
 
 
 def test_what_is_no_evaluation_is_refused(tmp_path: Path) -> None:
@@ -585,6 +597,24 @@ def test_the_office_course_stands_beside_the_paper(tmp_path: Path, monkeypatch: 
     assert "The office course beside the paper" in (tmp_path / "out" / "report.html").read_text()
     with pytest.raises(UserInputError, match=r"holds drives over the office course, whose table is table\.md"):
         command.make_report(OmegaConf.create({"runs": [str(course)], "out": str(tmp_path / "out")}))
+
+
+def test_courses_of_two_agents_stand_together_but_not_one_agent_acting_in_two_ways(tmp_path: Path) -> None:
+    def course(folder: str, agent: str, beta: float, spread: float) -> Path:
+        rows = [
+            {"run": agent, "agent": agent, "beta": beta, "direction": "forward", "repetition": 0}
+            | {"finished": True, "time_s": 100.0, "collisions": 0}
+        ]
+        (tmp_path / folder).mkdir()
+        pd.DataFrame(rows).to_csv(tmp_path / folder / "runs.csv", index=False)
+        described = {"seed": 0, "acting": {agent: {"num_candidates": 32, "spread": spread}}}
+        (tmp_path / folder / "course.json").write_text(json.dumps(described))
+        return tmp_path / folder
+
+    pow_, sac = course("a", "rcdsac_pow", -1.0, 1.0), course("b", "sac", NONE, 1.0)
+    assert read_courses([pow_, sac])["agent"].tolist() == ["rcdsac_pow", "sac"]
+    with pytest.raises(UserInputError, match=r"a and .*c let rcdsac_pow act differently \({'num_candidates': 32, "):
+        read_courses([pow_, sac, course("c", "rcdsac_pow", -2.0, 0.5)])
 
 
 def test_the_command_refuses_before_it_writes(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torchrl.objectives import LossModule
 
 import tiny
@@ -45,7 +46,8 @@ def closed(trainer: Trainer) -> Trainer:
 
 
 def assert_equal_states(one: torch.nn.Module, other: torch.nn.Module) -> None:
-    ours, theirs = one.state_dict(), other.state_dict()
+    """Compare all but the state of the loss's random numbers."""
+    ours, theirs = ({k: v for k, v in m.state_dict().items() if k != "_extra_state"} for m in (one, other))
     assert ours.keys() == theirs.keys()
     assert all(torch.equal(value, theirs[name]) for name, value in ours.items())
 
@@ -121,6 +123,29 @@ def test_a_finished_run_goes_on_as_another_run(tiny_run: Path, tmp_path: Path) -
     assert learner.replay.capacity_episodes == driven + tiny.AGENTS
     told = f"go on from {tiny_run} after its 2 iterations, with 4 episodes in the replay; not copied: random streams, "
     assert f"{told}schedule\n" in (tmp_path / "run" / "train.log").read_text()
+
+
+def test_random_numbers_follow_from_the_new_runs_seed(tiny_run: Path, tmp_path: Path) -> None:
+    states = [
+        begun(tiny_run, tmp_path / str(number), f"seed={seed}").learner.loss.rng_state
+        for number, seed in enumerate((5, 6, 5))
+    ]
+    assert torch.equal(states[0], states[2])
+    assert not torch.equal(states[0], states[1])
+    assert not torch.equal(states[0], named_agent(tiny_run, "last").load()[0].rng_state)
+
+
+@pytest.mark.parametrize(
+    ("group", "changed"), [("varied", {}), ("file", {"path": '/plans/b\u00fcro "west"\\new.json'})]
+)
+def test_a_run_on_maps_with_other_keys_goes_on_there(tmp_path: Path, group: str, changed: dict[str, str]) -> None:
+    cfg = compose("train", ["+algo=sac", f"map={group}", *(f"map.{key}=x" for key in changed)])
+    for key, value in changed.items():
+        cfg.map[key] = value
+    ended = tmp_path / "ended"
+    (ended / "checkpoints").mkdir(parents=True)
+    OmegaConf.save(cfg, ended / "config.yaml")
+    assert settings(f"init={ended}").map == training_settings(cfg).map
 
 
 def test_a_run_that_goes_on_is_the_runs_in_every_key_and_is_continued_bit_for_bit(

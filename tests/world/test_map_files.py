@@ -465,6 +465,14 @@ def test_what_cannot_serve_is_told_in_one_sentence(tmp_path: Path, case: str) ->
     assert "a" in str(refused.value)
 
 
+def test_a_first_goal_does_not_make_a_floor_large_enough_for_the_next(tmp_path: Path) -> None:
+    path = write_map_server(tmp_path / "a.yaml", room(40, 40))
+    settings = FileMapSettings(path=str(path), start=(1.0, 1.0, 0.0), goal=(1.6, 1.6))
+    with pytest.raises(UserInputError, match=r"and task\.min_path_m=4"):
+        check_file_maps(settings, 4.0)
+    check_file_maps(settings, 0.0)  # BARN's goals are given
+
+
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [

@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 from rcdsac_trl.deploy.policy.acting import ActingSettings, OverCritics
 from rcdsac_trl.deploy.policy.weights import Weights
+from rcdsac_trl.errors import UserInputError
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class ActingOverride:
 
     def __post_init__(self) -> None:
         """Refuse what lies outside the limits."""
-        self.of(ActingSettings())
+        replace(ActingSettings(), **self.given)  # type: ignore[arg-type]
 
     @property
     def given(self) -> dict[str, int | float | str]:
@@ -38,11 +39,20 @@ class ActingOverride:
     def of(self, own: ActingSettings) -> ActingSettings:
         """Return how an agent acts whose own config says that.
 
+        Raises:
+            UserInputError: if its critics are not to choose, and something is said of how they would.
+
         Example:
             >>> ActingOverride(num_candidates=32).of(ActingSettings(spread=0.5))
             ActingSettings(num_candidates=32, spread=0.5, over_critics='minimum', margin_m=0.0)
         """
-        return replace(own, **self.given)  # type: ignore[arg-type]
+        acting = replace(own, **self.given)  # type: ignore[arg-type]
+        if not acting.chooses and (idle := [name for name in self.given if name != "num_candidates"]):
+            raise UserInputError(
+                f"acting.{idle[0]}={self.given[idle[0]]} says how critics choose, and with acting.num_candidates=1 "
+                "they do not: leave it out, or raise that"
+            )
+        return acting
 
     def in_weights(self, weights: Weights) -> Weights:
         """Return an agent that acts so; acting otherwise than before, it has no offsets of its quantiles."""

@@ -13,7 +13,7 @@ from rcdsac_trl.world.maps.files.barn import GOAL_RADIUS_M, TIME_LIMIT_S, BarnMa
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
 from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.maps.map_mixture import MapMixture
-from rcdsac_trl.world.maps.map_source import MapSource
+from rcdsac_trl.world.maps.map_source import MapSource, check_maps
 from rcdsac_trl.world.task.rules import TaskSettings
 
 Section = TypeVar("Section", SensorSettings, TaskSettings, RobotSettings)
@@ -35,6 +35,15 @@ class ChosenWorld(NamedTuple):
     task: TaskSettings
     robot: RobotSettings
     barn: BarnMapSettings | None = None
+
+    def check_maps(self) -> None:
+        """Refuse files that maps cannot be made from, before anything is driven; BARN's goals are given.
+
+        Raises:
+            UserInputError: as :func:`rcdsac_trl.world.maps.map_source.check_maps`.
+        """
+        shortest_m = self.task.min_path_m if self.barn is None else 0.0
+        check_maps(self.maps, shortest_m, self.robot.circumradius_m)
 
 
 def chosen_world(

@@ -38,6 +38,17 @@ class ControllerSettings:
         if self.window_steps < 2:
             raise UserInputError(f"controller.window_steps={self.window_steps} must be at least 2")
 
+    def check_reach(self, reach_m: float) -> None:
+        """Refuse a distance that range sensors of that reach, m, never tell.
+
+        Raises:
+            UserInputError: naming both.
+        """
+        if self.near_m > reach_m:
+            raise UserInputError(
+                f"controller.near_m={self.near_m:g} is beyond the {reach_m:g} m that agents see: lower it"
+            )
+
 
 @dataclass(frozen=True)
 class VideoSettings:
@@ -130,6 +141,7 @@ class EvaluationSettings:
             or self.navigation.watchdog,
             "does not allow for a latency: leave latency_s out": self.latency_s,
             "has no weights to be rounded: leave half_precision out": self.half_precision,
+            "has no checkpoints: leave checkpoint out": self.checkpoint,
             "has no critics to choose by: leave acting out": self.acting.given,
             "has no beta to turn: leave beta_controller out": self.beta_controller,
         }
@@ -183,6 +195,10 @@ class EvaluationSettings:
         """Return map set, sensor, task and robot: those of a training, with what was chosen in their place.
 
         Raises:
-            UserInputError: as :func:`~rcdsac_trl.config.chosen_world.chosen_world`.
+            UserInputError: as :func:`~rcdsac_trl.config.chosen_world.chosen_world`, and if a controller reads
+                distances that this robot's sensor does not tell.
         """
-        return chosen_world(trained, self.run, maps=self.map, sensor=self.sensor, task=self.task, robot=self.robot)
+        chosen = chosen_world(trained, self.run, maps=self.map, sensor=self.sensor, task=self.task, robot=self.robot)
+        if "clearance" in (self.beta_controller or ()):
+            self.controller.check_reach(chosen.robot.lidar.max_range_m)
+        return chosen

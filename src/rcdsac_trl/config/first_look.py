@@ -41,7 +41,7 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     settings.latency_of(trained)
     chosen = settings.world_of(trained)
     WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=chosen.robot)
-    check_maps(chosen.maps, chosen.task.min_path_m, chosen.robot.circumradius_m)
+    chosen.check_maps()
     _look_at_out(settings.out)
 
 

@@ -1,6 +1,7 @@
 """What ``train init=<agent>`` chooses unless a user says otherwise: an agent goes on as what it is."""
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -9,9 +10,12 @@ from rcdsac_trl.config.command_line import key_of
 from rcdsac_trl.config.named_folder import find_agent
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
+from rcdsac_trl.world.maps.map_mixture import MapMixture
 
 # It is driven by itself from the start, and already averse.
 _NO_START = {"pursuit_iterations": 0, "neutral_iterations": 0, "ramp_iterations": 0}
+# Maps that have other keys than the default's.
+_GROUPS = {FileMapSettings: "file", MapMixture: "varied"}
 _OF_RUN = ("map", "task", "world", "learner", "replay", "schedule", "validation", "acting")
 
 
@@ -32,11 +36,11 @@ def with_the_agents_own(named: str, overrides: Sequence[str]) -> list[str]:
     sections, groups = _of_agent(settings), []
     if found.is_run and "preset" not in chosen:
         sections |= _of_run(settings)
-        if isinstance(settings.map, FileMapSettings) and "map" not in chosen:
-            groups = ["map=file"]  # which has other keys than the default
+        if (group := _GROUPS.get(type(settings.map))) is not None and "map" not in chosen:
+            groups = [f"map={group}"]
     # Who chooses another of a group takes that as a whole.
     own = [leaf for name, values in sections.items() if name not in chosen for leaf in _leaves(name, values)]
-    return [*groups, *(f"++{key}={json.dumps(value)}" for key, value in own), *overrides]
+    return [*groups, *(f"++{key}={_written(value)}" for key, value in own), *overrides]
 
 
 def _of_agent(settings: TrainingSettings) -> dict[str, dict[str, Any]]:
@@ -65,3 +69,13 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         return
     for key, below in value.items():
         yield from _leaves(f"{name}.{key}", below)
+
+
+def _written(value: Any) -> str:
+    """Write a value as Hydra reads it: JSON, but texts, in which only quotes and what is before them are escaped."""
+    if isinstance(value, list | tuple):
+        return f"[{','.join(_written(each) for each in value)}]"
+    if not isinstance(value, str):
+        return json.dumps(value)
+    before_quotes = re.sub(r'(\\*)"', r"\1\1\"", value)
+    return '"' + re.sub(r"(\\+)$", r"\1\1", before_quotes) + '"'

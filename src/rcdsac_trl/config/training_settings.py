@@ -188,6 +188,11 @@ class TrainingSettings:
                 )
             )
         self.acting.check_heads(self.network.look_ahead)
+        if self.learner.n_steps > 1 and self.algo.relabel == "resample" and self.learner.resample_per == "transition":
+            raise UserInputError(
+                f"learner.n_steps={self.learner.n_steps} sums rewards over transitions of one beta, and with "
+                "learner.resample_per=transition each has its own: choose learner.resample_per=sequence"
+            )
         iteration_steps = self.training_world.num_agents * episode_steps
         if self.replay.capacity_steps < iteration_steps:
             raise UserInputError(

@@ -132,7 +132,7 @@ def _as_driven(
     agent = Agent(packed(average.module), packed_loss(loss))
     horizon_steps = settings.horizon_in(trained.task.episode_steps)
     make = partial(driven_returns, spec, agent, every_steps=settings.every_steps, horizon_steps=horizon_steps)
-    return make, partial(driven_findings, named.recalibration)
+    return make, partial(driven_findings, named.recalibration(spec.acting))
 
 
 def _threads(settings: CalibrationSettings) -> int:
@@ -182,12 +182,13 @@ def _described_branched(settings: CalibrationSettings, named: NamedAgent) -> dic
 
 
 def _described_as_driven(settings: CalibrationSettings, named: NamedAgent) -> dict[str, Any]:
-    recalibration = named.recalibration
+    acting = settings.acting_of(named.settings)
+    recalibration = named.recalibration(acting)
     return {
         "as_driven": True,
         "num_episodes": settings.num_episodes,
         "every_steps": settings.every_steps,
-        "acting": asdict(settings.acting_of(named.settings)),
+        "acting": asdict(acting),
         "betas": [condition.beta for condition in named.settings.algo.conditions(settings.beta, None)],
         "recalibration": None if recalibration is None else asdict(recalibration),
     }

@@ -33,7 +33,7 @@ from rcdsac_trl.system import resources, runtime
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
-from rcdsac_trl.world.maps.map_source import check_maps, with_digests
+from rcdsac_trl.world.maps.map_source import with_digests
 from rcdsac_trl.world.sim.bullet import check_display
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.world_settings import WorldSettings
@@ -59,7 +59,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
         named = named_agent(settings.run, settings.checkpoint, half_precision=settings.half_precision)
     trained = default_training() if named is None else named.settings
     chosen = settings.world_of(trained)
-    check_maps(chosen.maps, chosen.task.min_path_m, chosen.robot.circumradius_m)
+    chosen.check_maps()
     worlds = [] if chosen.barn is None else timed(chosen.barn.worlds()[: settings.num_maps])
     num_maps = len(worlds) or settings.num_maps
     if settings.record and settings.video.map >= num_maps:
@@ -89,7 +89,7 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
 
     def film(folder: Path, rows: Rows) -> list[Path]:
         headings = [f"{_name(settings, trained)}  {condition.heading}".strip() for condition in spec.conditions]
-        recalibration = None if named is None else named.recalibration
+        recalibration = None if named is None else named.recalibration(spec.acting)
         return write_film(spec, agent(), settings.video, headings, folder, recalibration)
 
     out = Path(settings.out) if settings.out is not None else _default_out(settings, spec, named, num_maps)

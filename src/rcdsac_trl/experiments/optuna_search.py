@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 
 CONFIG = "search"
 _OWN = ("search", "space")
-_FOLDER = "folder"
+_FOLDER, _ASKED = "folder", "asked"
 _LOCK = "search.lock"  # held by the search whose trial it is: the training takes its own only seconds later
+_WORTH = ("collision_cost", "averaged_validations")  # what a trial is worth depends on these
 _SILENCE_S = 60.0  # a trial takes many minutes, and its own folder tells more
 _NEIGHBOURS = 3  # trials that must have come as far before a median says anything
 
@@ -114,10 +115,24 @@ class Search:
                 n_min_trials=_NEIGHBOURS,
             ),
         )
-        # What there is already counts in, else a search that goes on would draw its first trials once more.
-        seed = torch_seed(settings.seed, "search", len(study.get_trials(deepcopy=False)))
-        study.sampler = optuna.samplers.TPESampler(seed=seed % 2**32, n_startup_trials=settings.startup_trials)
+        _check_same(study, self._asked)
         return study
+
+    @property
+    def _asked(self) -> dict[str, str]:
+        """What trials of one study have in common, by key: what they train, where they differ, what they are worth."""
+        fixed = {key_of(override): override.partition("=")[2] for override in self.trial.overrides}
+        searched = {key: str(kind) for key, kind in self.searched.items()}
+        return fixed | searched | {f"search.{key}": f"{getattr(self.settings, key):g}" for key in _WORTH}
+
+    def _ask(self) -> "optuna.Trial":
+        """Begin a trial whose proposals follow from its number: searches side by side propose different ones."""
+        import optuna
+
+        trial = self.study.ask()
+        seed = torch_seed(self.settings.seed, "search", trial.number) % 2**32
+        self.study.sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=self.settings.startup_trials)
+        return trial
 
     def run(self) -> None:
         """Try until there are as many trials as asked for; then tell the best one."""
@@ -129,7 +144,7 @@ class Search:
         with never_silent(_SILENCE_S), Work(doing, left, "trial") as work:
             while (done := len(self._done())) < settings.trials:
                 self._take_up_what_was_lost()
-                trial = self.study.ask()
+                trial = self._ask()
                 state = self._try(trial)
                 value = self._tell(trial, state)
                 print(f"{done + 1}/{settings.trials} {self._described(trial, state, value)}", flush=True)
@@ -241,3 +256,20 @@ class Search:
         best = self.study.best_trial
         print(f"best {best.value:.1f} {self.folder / best.user_attrs[_FOLDER]}")
         print(f"{program()} train {' '.join(self.trial.overrides)} {self._as_overrides(best.params)}")
+
+
+def _check_same(study: "optuna.Study", asked: Mapping[str, str]) -> None:
+    """Note in a new study what its trials have in common; refuse to go on with one whose trials have something else.
+
+    Raises:
+        UserInputError: naming the first key that differs.
+    """
+    noted = study.user_attrs.get(_ASKED)
+    if noted is None:
+        study.set_user_attr(_ASKED, dict(asked))
+    elif differing := sorted(key for key in noted.keys() | asked.keys() if noted.get(key) != asked.get(key)):
+        here, there = (values.get(differing[0], "not given") for values in (asked, noted))
+        raise UserInputError(
+            f"search.name={study.study_name} has trials with {differing[0]} {there}, and now it is {here}: ask for the "
+            "same again, or give another search.name"
+        )

@@ -32,6 +32,11 @@ class Number:
         if self.log and self.low <= 0:
             raise UserInputError(f"interval({self.low:g},{self.high:g}) has no logarithm: begin above 0")
 
+    def __str__(self) -> str:
+        """Write it as on the command line."""
+        written = f"interval({self.low!r},{self.high!r})"
+        return f"tag(log,{written})" if self.log else written
+
     def suggest(self, trial: "optuna.Trial", key: str) -> str:
         """Let a trial choose, and write it as an override's value."""
         if isinstance(self.low, int) and isinstance(self.high, int):
@@ -44,6 +49,10 @@ class Choice:
     """One of several values, written as on the command line."""
 
     values: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Write it as on the command line."""
+        return f"choice({','.join(self.values)})"
 
     @property
     def low(self) -> str:

@@ -23,6 +23,7 @@ from rcdsac_trl.config.run_config import (
     settings_of_run,
 )
 from rcdsac_trl.config.training_settings import TrainingSettings
+from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.deploy.policy.registry import is_shipped
 from rcdsac_trl.deploy.policy.weights import WEIGHTS_NAME, Weights, halved, read_weights, stored
@@ -74,10 +75,13 @@ class NamedAgent(ABC):
     def training(self) -> bytes | None:
         """The config of its training, as a file; None where there is none."""
 
-    @property
     @abstractmethod
-    def recalibration(self) -> Recalibration | None:
-        """By what it tells the quantiles of the return; None: as its critics say them."""
+    def recalibration(self, acting: ActingSettings) -> Recalibration | None:
+        """Return by what it tells the quantiles of the return; None: as its critics say them.
+
+        Args:
+            acting: how it acts; set to act otherwise than it was measured, it earns something else.
+        """
 
     @abstractmethod
     def weights(self) -> Weights:
@@ -142,9 +146,8 @@ class RunAgent(NamedAgent):
         """The run's config."""
         return (self.folder / CONFIG_NAME).read_bytes()
 
-    @property
-    def recalibration(self) -> None:
-        """Nothing: what is published or exported of a run gets it."""
+    def recalibration(self, acting: ActingSettings) -> None:
+        """Return nothing: what is published or exported of a run gets it."""
 
     def weights(self) -> Weights:
         """Read the averaged actor and the critics."""
@@ -217,10 +220,10 @@ class ExportedAgent(NamedAgent):
         path = self.folder / TRAINING_NAME
         return path.read_bytes() if path.is_file() else None
 
-    @property
-    def recalibration(self) -> Recalibration | None:
-        """What it was written with."""
-        return self.read.config.recalibration
+    def recalibration(self, acting: ActingSettings) -> Recalibration | None:
+        """Return what it was written with, where it acts as it does by itself."""
+        config = self.read.config
+        return config.recalibration if acting == config.acting else None
 
     def weights(self) -> Weights:
         """Return what was read."""

@@ -172,12 +172,12 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
         folders: as for :func:`~rcdsac_trl.report.evaluation_folders.find_evaluations`.
 
     Raises:
-        UserInputError: if there are none, if maps, starts, goals or rules differ, if training seeds of one agent act
-            differently, or if two hold the same.
+        UserInputError: if there are none, if maps, starts, goals or rules differ, if training seeds of one agent have
+            other risk measures or act differently, or if two hold the same.
     """
     evaluations = [read_evaluation(folder) for folder in find_evaluations(folders)]
     _check_same_maps(evaluations)
-    _check_same_acting(evaluations)
+    _check_one_agent(evaluations)
     tables = [
         evaluation.episodes.assign(
             agent=evaluation.described["agent"],
@@ -232,12 +232,18 @@ def _check_same_maps(evaluations: Sequence[Evaluation]) -> None:
             )
 
 
-def _check_same_acting(evaluations: Sequence[Evaluation]) -> None:
-    """Refuse to call one agent what chooses its actions in two ways: its seeds would be averaged."""
+def _check_one_agent(evaluations: Sequence[Evaluation]) -> None:
+    """Refuse to call one agent what was trained or chooses its actions in two ways: its seeds would be averaged."""
     firsts: dict[tuple[str, str], Evaluation] = {}
     for other in evaluations:
         agent = other.described["agent"], other.described["sensor"]
         first = firsts.setdefault(agent, other)
+        here, there = (evaluation.described.get("measure") for evaluation in (first, other))
+        if None not in (here, there) and here != there:  # evaluations of earlier versions say nothing of theirs
+            raise UserInputError(
+                f"{first.folder} and {other.folder} are both of {agent[0]}, with the risk measures {here} and {there}: "
+                "train with a name for each (algo.name), or report on them apart"
+            )
         here, there = _acting_of(first), _acting_of(other)
         if here != there:
             raise UserInputError(

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -11,6 +12,8 @@ from rcdsac_trl.report.evaluation_folders import COURSE
 
 # Who drove, and what the version of the code was called, may differ; all else decides what they met.
 _MAY_DIFFER = ("entries", "agents", "commit")
+# Says of each run by its name how it acted: one that is in two folders must have acted alike.
+_BY_RUN = "acting"
 _WHO = ["run", "agent", "beta"]
 _RUN = ["direction", "repetition"]
 
@@ -28,12 +31,13 @@ def read_courses(folders: Sequence[Path]) -> pd.DataFrame:
     tables = [_read(folder) for folder in folders]
     for folder, (described, _) in zip(folders[1:], tables[1:], strict=True):
         first = tables[0][0]
-        for key in sorted((first.keys() | described.keys()) - {*_MAY_DIFFER}):
+        for key in sorted((first.keys() | described.keys()) - {*_MAY_DIFFER, _BY_RUN}):
             if first.get(key) != described.get(key):
                 raise UserInputError(
                     f"{folders[0]} and {folder} drove the course under different conditions ({key} is {first.get(key)} "
                     f"and {described.get(key)}): report on them apart"
                 )
+    _check_same_acting(folders, [dict(described.get(_BY_RUN, {})) for described, _ in tables])
     runs = pd.concat([table for _, table in tables], ignore_index=True)
     if (twice := runs.duplicated([*_WHO, *_RUN])).any():
         run, agent = runs.loc[twice, ["run", "agent"]].iloc[0]
@@ -41,7 +45,18 @@ def read_courses(folders: Sequence[Path]) -> pd.DataFrame:
     return runs
 
 
-def _read(folder: Path) -> tuple[dict[str, object], pd.DataFrame]:
+def _check_same_acting(folders: Sequence[Path], acting: Sequence[dict[str, object]]) -> None:
+    firsts: dict[str, tuple[Path, object]] = {}
+    for folder, by_run in zip(folders, acting, strict=True):
+        for run, how in by_run.items():
+            other, before = firsts.setdefault(run, (folder, how))
+            if how != before:
+                raise UserInputError(
+                    f"{other} and {folder} let {run} act differently ({before} and {how}): report on them apart"
+                )
+
+
+def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     try:
         described = dict(json.loads((folder / COURSE).read_text(encoding="utf-8")))
         runs = pd.read_csv(folder / "runs.csv")

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.guard import BLUR_M, LEAST_M, SHARES, Guard
+from rcdsac_trl.robot.latency import Ahead
 from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.robot.stopping_path import STANDS_M_PER_S, STEP_S
 from rcdsac_trl.system.jit import njit
@@ -24,24 +25,25 @@ class CompiledGuard(Guard):
         v: float,
         omega: float,
         sectors: Sectors,
-        moving: tuple[float, float],
+        begin: Ahead,
         been: NDArray[np.float64] | None = None,
     ) -> float:
         if been is not None or not self._is_a_disc:
-            return super()._fastest(v, omega, sectors, moving, been)
-        borders, nearest = self._within_reach(sectors, max(abs(v), abs(moving[0])))
+            return super()._fastest(v, omega, sectors, begin, been)
+        borders, nearest = self._within_reach(sectors, abs(v), begin)
         if not len(nearest):
             return 1.0
         changes = self.robot.max_acceleration_m_per_s2 * STEP_S, self.robot.max_angular_acceleration * STEP_S
         kept = self.radius_m, self.margin_m
-        share = _fastest_of_disc((v, omega), moving, self._reacting, changes, kept, borders, nearest, _DEFINED)
+        state = begin.pose, begin.velocities
+        share = _fastest_of_disc((v, omega), state, self._reacting, changes, kept, borders, nearest, _DEFINED)
         return float(share)
 
 
 @njit
 def _fastest_of_disc(
     wanted: tuple[float, float],
-    moving: tuple[float, float],
+    state: tuple[tuple[float, float, float], tuple[float, float]],
     reacting: int,
     changes: tuple[float, float],
     kept: tuple[float, float],
@@ -51,10 +53,11 @@ def _fastest_of_disc(
 ) -> float:
     """Return the largest share of the wanted speed whose way keeps its distance, 0 if none does."""
     (radius_m, margin_m), (shares, step_s, blur_m, least_m, stands) = kept, defined
-    now_m = _gap(0.0, 0.0, borders, nearest) - radius_m
+    pose, moving = state
+    now_m = _gap(pose[0], pose[1], borders, nearest) - radius_m
     needed_m = min(margin_m, max(now_m - blur_m, least_m), now_m)
     for share in shares:
-        x = y = yaw = 0.0
+        x, y, yaw = pose
         v, omega = moving
         free, step = True, 0
         while free and (step < reacting or abs(v) > stands):

@@ -6,6 +6,7 @@ obstacle. Where the wish leads into it at any speed, the robot creeps along besi
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.latency import Ahead, at_once
+from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors, check_switches
@@ -25,6 +28,7 @@ SHARES = (1.0, 0.75, 0.5, 0.25)
 # within the margin may seem to come so much nearer, but never below the least that must stay.
 BLUR_M = 0.01
 LEAST_M = 0.01
+_STANDING = at_once((0.0, 0.0))
 # Half the angle ahead (or behind) in which something must be sensed at all before the robot moves that way.
 _WAY_RAD = math.radians(30.0)
 
@@ -70,7 +74,7 @@ class Guard:
             taken to hold what the robot carries.
         margin_m: what is kept between that circle, or outline, and everything that is sensed. Who is nearer may drive
             along it or away from it, and nearer by 1 cm a call, the blur of a sector, until 1 cm is left.
-        reaction_s: how long a command may last until the next one arrives and acts.
+        reaction_s: how long a command may act until the next one does.
         blind_reverse: whether the robot may drive backwards (or forwards) where it senses nothing at all.
         evade: whether it may turn otherwise than it was told where it would stand for good: it creeps along beside what
             is in the way, or turns on the spot until it can.
@@ -132,11 +136,6 @@ class Guard:
         }
         return cls(**{**limits, **changes, "robot": robot})
 
-    @classmethod
-    def of_late(cls, robot: RobotSettings, latency_s: float) -> "Guard":
-        """Return the guard of a robot whose commands act so late, s: it looks so much farther ahead."""
-        return cls.of(robot, reaction_s=cls.reaction_s + latency_s)
-
     def limit(
         self,
         v: float,
@@ -144,6 +143,7 @@ class Guard:
         sectors: Sectors,
         moving: tuple[float, float] = (0.0, 0.0),
         been: NDArray[np.float64] | None = None,
+        ahead: Ahead | None = None,
     ) -> tuple[float, float, str | None]:
         """Return the velocities that may be driven, and why they are not those that were wanted.
 
@@ -159,36 +159,39 @@ class Guard:
             moving: measured velocities, m/s and rad/s.
             been: where the robot's centre has been while it drove ahead, [k, 2], m, in its frame now: nothing stands
                 there, so it may drive back that way without sensing it. None: nobody knows.
+            ahead: where the robot will be when this command begins to act, by the commands that are under way; None: it
+                acts at once.
         """
+        begin = at_once(moving) if ahead is None else ahead
         fast, turning = v, omega
         v = min(max(v, -self.max_reverse_m_per_s), self.max_speed_m_per_s)
         omega = min(max(omega, -self.max_turn_rad_per_s), self.max_turn_rad_per_s)
         reason = None if (v, omega) == (fast, turning) else "the speed limit"
         if v == 0.0:
-            turn = self._turn_on_the_spot(omega, sectors, moving)
+            turn = self._turn_on_the_spot(omega, sectors, begin)
             return 0.0, turn, reason if turn == omega else "the stop zone"
         if self.blind_reverse or np.count_nonzero(sectors.covered[_AHEAD if v > 0.0 else _BEHIND]):
             been = None  # it sees where it goes
         elif v > 0.0 or been is None:
             blind = f"nothing senses what lies {'ahead' if v > 0 else 'behind'}"
-            return 0.0, self._turn_on_the_spot(omega, sectors, moving), blind
-        share = self._fastest(v, omega, sectors, moving, been)
+            return 0.0, self._turn_on_the_spot(omega, sectors, begin), blind
+        share = self._fastest(v, omega, sectors, begin, been)
         if share > 0.0:
             return share * v, omega, reason if share == 1.0 else "the stop zone"
         if self.evade and v > 0.0:
-            v, omega = self._evading(v, omega, sectors, moving)
+            v, omega = self._evading(v, omega, sectors, begin)
             if v > 0.0:
                 return v, omega, "the stop zone"
-        return 0.0, self._turn_on_the_spot(omega, sectors, moving), "the stop zone"
+        return 0.0, self._turn_on_the_spot(omega, sectors, begin), "the stop zone"
 
-    def _evading(self, v: float, omega: float, sectors: Sectors, moving: tuple[float, float]) -> tuple[float, float]:
+    def _evading(self, v: float, omega: float, sectors: Sectors, begin: Ahead) -> tuple[float, float]:
         """Return velocities that lead past what is in the way: creeping, or else turning on the spot."""
         creep = min(v, _CREEP_M_PER_S)
         turns = self.max_turn_rad_per_s * _TURNS
         turns = turns[np.argsort(np.abs(turns - omega), kind="stable")].tolist()
         shares: list[float] = []
         for turn in turns:
-            shares.append(self._fastest(creep, turn, sectors, moving))
+            shares.append(self._fastest(creep, turn, sectors, begin))
             if shares[-1] >= _WORTH_IT:
                 return shares[-1] * creep, turn
         if (towards := self._turn_to_a_way(creep, omega, sectors)) is not None:
@@ -205,7 +208,7 @@ class Guard:
                 if bins > swings[way]:
                     continue
                 turned = np.roll(sectors.distances_m, -round(way * bins))
-                if self._fastest(creep, 0.0, replace(sectors, distances_m=turned), (0.0, 0.0)) >= _WORTH_IT:
+                if self._fastest(creep, 0.0, replace(sectors, distances_m=turned), _STANDING) >= _WORTH_IT:
                     return way * _TURN_SHARE * self.max_turn_rad_per_s
         return None
 
@@ -215,7 +218,7 @@ class Guard:
         Within the margin its corners come nearer little by little, so the least that must stay counts.
         """
         half = NUM_BINS // 2
-        borders, nearest = self._within_reach(sectors, 0.0)
+        borders, nearest = self._within_reach(sectors, 0.0, _STANDING)
         if self._is_a_disc or not len(nearest):
             return half
         turned = way * BIN_RAD * np.arange(half + 1)
@@ -224,18 +227,18 @@ class Guard:
         touching = np.flatnonzero(clearance < min(LEAST_M, float(clearance[0])))
         return int(touching[0]) - 1 if len(touching) else half
 
-    def _turn_on_the_spot(self, omega: float, sectors: Sectors, moving: tuple[float, float]) -> float:
+    def _turn_on_the_spot(self, omega: float, sectors: Sectors, begin: Ahead) -> float:
         """Return the largest of the shares of a turn that keeps the stop zone free while the robot stands, or brakes.
 
         Where none does, it is to turn no more.
         """
         if self._is_a_disc or omega == 0.0:
             return omega
-        borders, nearest = self._within_reach(sectors, abs(moving[0]))
+        borders, nearest = self._within_reach(sectors, 0.0, begin)
         if not len(nearest):
             return omega
         for share in SHARES:
-            places, headings = stopping_paths([0.0], share * omega, moving, self._reacting, self.robot)
+            places, headings = self._ways([0.0], share * omega, begin)
             clearance = self._clearances(places, headings, borders, nearest)[0]
             if clearance.min() >= self._needed_m(float(clearance[0])):
                 return share * omega
@@ -250,18 +253,18 @@ class Guard:
         v: float,
         omega: float,
         sectors: Sectors,
-        moving: tuple[float, float],
+        begin: Ahead,
         been: NDArray[np.float64] | None = None,
     ) -> float:
         """Return the largest of the shares of `v` whose way keeps its distance, 0 if none does.
 
         With `been`, the way must lead where the robot has been, too.
         """
-        borders, nearest = self._within_reach(sectors, max(abs(v), abs(moving[0])))
+        borders, nearest = self._within_reach(sectors, abs(v), begin)
         if been is None and not len(nearest):
             return 1.0
         speeds = [share * v for share in SHARES]
-        places, headings = stopping_paths(speeds, omega, moving, self._reacting, self.robot)
+        places, headings = self._ways(speeds, omega, begin)
         allowed = np.ones(len(SHARES), np.bool_)
         if len(nearest):
             clearance = self._clearances(places, headings, borders, nearest)
@@ -270,10 +273,21 @@ class Guard:
             allowed &= self._has_been(places, been)
         return next((share for share, free in zip(SHARES, allowed.tolist(), strict=True) if free), 0.0)
 
-    def _within_reach(self, sectors: Sectors, speed: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the directions of what is in reach of who is never faster, [2, m], and how far it is, m, [m]."""
+    def _ways(
+        self, speeds: Sequence[float], omega: float, begin: Ahead
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the ways that begin somewhere, as :func:`stopping_paths` does, in the robot's frame now."""
+        places, headings = stopping_paths(speeds, omega, begin.velocities, self._reacting, self.robot)
+        if begin.pose == _STANDING.pose:
+            return places, headings
+        return placed(places.reshape(-1, 2), begin.pose).reshape(places.shape), placed(headings, (0, 0, begin.pose[2]))
+
+    def _within_reach(
+        self, sectors: Sectors, speed: float, begin: Ahead
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the directions of what is in reach of who is told a speed, [2, m], and how far it is, m, [m]."""
         # What is out of reach of the whole way cannot be near to any of it.
-        return sensed_within(sectors, self._reach(speed))
+        return sensed_within(sectors, self.reach_m(speed, begin))
 
     def _has_been(self, places: NDArray[np.float64], been: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return of which ways all places lie within where the robot has been, bool [shares].
@@ -316,10 +330,18 @@ class Guard:
         """How many steps a command may last."""
         return math.ceil(self.reaction_s / STEP_S - 1e-9)
 
-    def _reach(self, speed: float) -> float:
-        """Return how near to here, m, something must be to matter to who is never faster than `speed`."""
+    def reach_m(self, speed: float, begin: Ahead) -> float:
+        """Return how near to here, m, something must be to matter to a command.
+
+        Args:
+            speed: that it wants, m/s, either way.
+            begin: where the robot is when it begins to act.
+        """
+        x, y, _ = begin.pose
+        fastest = max(speed, abs(begin.velocities[0]))
         held_m = self.radius_m if self._is_a_disc else self.robot.circumradius_m  # corners reach so far
-        return held_m + self.margin_m + speed * (self.reaction_s + STEP_S) + self.robot.stopping_distance_m(speed)
+        driven_m = fastest * (self.reaction_s + STEP_S) + self.robot.stopping_distance_m(fastest)
+        return math.hypot(x, y) + held_m + self.margin_m + driven_m
 
 
 def _check_robot(robot: object) -> None:

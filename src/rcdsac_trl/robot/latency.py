@@ -68,6 +68,11 @@ class Ahead(NamedTuple):
         return np.append(placed(np.array([[x, y]]), pose)[0], pose[2] + yaw)
 
 
+def at_once(velocities: tuple[float, float]) -> Ahead:
+    """Return where a robot will be whose next command acts at once: where it is, as fast as it is, m/s and rad/s."""
+    return Ahead((0.0, 0.0, 0.0), velocities, 0.0)
+
+
 class Latency:
     """The commands of one robot that are under way, and where they lead.
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from rcdsac_trl.robot.latency import Latency
+from rcdsac_trl.robot.latency import Ahead, Latency
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.remembered_ranges import RememberedRanges
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
@@ -17,6 +17,9 @@ class ForesightedPolicy(Timed, TensorDictModuleBase):
     """A policy whose agents are told waypoints, velocities and what is remembered as they will be.
 
     Range bins stay as they are.
+
+    Attributes:
+        foreseen: where each robot will be when the command that follows the last observation begins to act.
 
     Args:
         policy: acts on `waypoint`, `velocity` and `remembered`.
@@ -42,6 +45,7 @@ class ForesightedPolicy(Timed, TensorDictModuleBase):
         self._latencies = [Latency(latency_s, robot) for _ in range(num_agents)]
         self._memories = [RememberedRanges(sensed, memory_s, robot) for _ in range(num_agents)]
         self._times_s = [0.0] * num_agents
+        self.foreseen: list[Ahead] = []
         self._max_range_m = robot.lidar.max_range_m
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -58,6 +62,7 @@ class ForesightedPolicy(Timed, TensorDictModuleBase):
         velocities = tensordict["velocity"].tolist()
         begins = tensordict["is_init"][:, 0].tolist()
         waypoints, moving, remembered = [], [], []
+        self.foreseen = []
         for row, (latency, memory) in enumerate(zip(self._latencies, self._memories, strict=True)):
             v, omega, *commanded = velocities[row]
             elapsed_s = 0.0 if begins[row] else self.periods_s[row]
@@ -69,6 +74,7 @@ class ForesightedPolicy(Timed, TensorDictModuleBase):
                 latency.note((commanded[0], commanded[1]), self._times_s[row])
                 self._times_s[row] += elapsed_s
             ahead = latency.ahead((v, omega), self._times_s[row])
+            self.foreseen.append(ahead)
             first, second = ahead.seen(places[row]).tolist()
             waypoints.append(waypoint_observation(AT_ORIGIN, first, second))
             moving.append([*ahead.velocities, *commanded])

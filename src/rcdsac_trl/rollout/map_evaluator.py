@@ -197,7 +197,7 @@ def _navigated(spec: EvaluationSpec, policy: TensorDictModuleBase, num_agents: i
         num_agents,
         boldest=algo.distortion.measure.high if asked.watchdog and algo.context_key == "risk" else None,
         robot=robot,
-        guard=CompiledGuard.of_late(robot, spec.latency_s) if asked.stop_zone else None,
+        guard=CompiledGuard.of(robot) if asked.stop_zone else None,
     )
 
 

@@ -13,9 +13,11 @@ from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator, NavigatorS
 from rcdsac_trl.deploy.navigation.static_layer import StaticLayer
 from rcdsac_trl.robot.action import action_of, desired_velocities
 from rcdsac_trl.robot.guard import Guard
+from rcdsac_trl.robot.latency import at_once
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_distances, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors
+from rcdsac_trl.rollout.foresight import ForesightedPolicy
 from rcdsac_trl.rollout.timed import Timed
 
 
@@ -33,7 +35,8 @@ class NavigatedPolicy(Timed, TensorDictModuleBase):
     """A policy whose agents are advised, each by a navigator of its own.
 
     Args:
-        policy: acts on `waypoint`, and on `risk` if its agents are told one.
+        policy: acts on `waypoint`, and on `risk` if its agents are told one; where it is a
+            :class:`ForesightedPolicy`, the guard limits from where that foresees its robots.
         make: makes a navigator.
         sensed: which of the 180 sectors the sensor has, bool [180].
         num_agents: that it acts for.
@@ -73,14 +76,16 @@ class NavigatedPolicy(Timed, TensorDictModuleBase):
             boldness = torch.tensor([[each.boldness] for each in advice], dtype=torch.float32, device="cpu")
             asked["risk"] = tensordict["risk"] + boldness * (self._boldest - tensordict["risk"])
         asked = self.policy(asked)
+        foreseen = self.policy.foreseen if isinstance(self.policy, ForesightedPolicy) else None
         action = asked["action"].clone()
         for row, each in enumerate(advice):
             driven = each.instead
             if self._guard is not None:
                 wish = desired_velocities(action[row].tolist(), self._robot) if driven is None else driven
                 seen = Sectors(distances_m[row], self._sensed, self._robot.lidar.max_range_m)
-                known = self._navigators[row].known(seen, None)
-                v, omega, limited = self._guard.limit(*wish, known, velocities[row], each.been)
+                ahead = at_once(velocities[row]) if foreseen is None else foreseen[row]
+                known = self._navigators[row].known(seen, None, self._guard.reach_m(abs(wish[0]), ahead))
+                v, omega, limited = self._guard.limit(*wish, known, velocities[row], each.been, ahead)
                 driven = driven if limited is None else (v, omega)
             if driven is not None:
                 action[row] = torch.tensor(action_of(*driven, self._robot), dtype=torch.float32, device="cpu")

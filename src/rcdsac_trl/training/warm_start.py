@@ -17,6 +17,7 @@ from rcdsac_trl.storage.checkpoint import load_optimizer
 from rcdsac_trl.storage.checkpoint_record import Saved, find
 from rcdsac_trl.training.learner import Learner
 
+_RANDOM = "_extra_state"  # where a loss keeps its generator
 _CRITICS, _TARGETS = "critic_network_params.", "target_critic_network_params."
 # What makes the episodes of one run worth as much to another.
 _WORLD = ("algo", "sensor", "robot", "task", "map")
@@ -118,6 +119,7 @@ def begin_with_agent(learner: Learner, settings: TrainingSettings, checkpoint: C
             if name.startswith(_CRITICS)
         }
     own = learner.loss.state_dict()
+    state[_RANDOM] = own[_RANDOM]  # its random numbers follow from its own seed
     if not has_temperature:
         state["log_alpha"] = own["log_alpha"]
     _check_same_shapes(settings.init, own, state)

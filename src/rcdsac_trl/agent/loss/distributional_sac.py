@@ -119,7 +119,7 @@ class DistributionalSACLoss(LinkedLoss):
         """Return the three losses and detached diagnostics of a batch ``[B, L+1]``.
 
         ``loss_*`` are to be summed and differentiated. ``alpha`` is the temperature, ``entropy`` the policy's in
-        nats, ``td_error`` the mean absolute pairwise temporal difference (largest over the critics), ``q_value`` the
+        nats, ``td_error`` how far mean target and mean prediction are apart (most over the critics), ``q_value`` the
         mean prediction and ``quantile_spread`` the standard deviation over a prediction's sampled quantiles.
         """
         if tensordict.ndim != 2 or tensordict.shape[1] < self.settings.burn_in + 2:

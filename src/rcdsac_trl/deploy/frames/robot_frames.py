@@ -99,7 +99,8 @@ class RobotFrames:
         self._odom_frame = named(odom_frame)
         self._base_frame = named(self._settings.base_frame or base_frame or _USUAL_BASE)
         if self._odometry.frames and stamp_s < self._odometry.latest(_START, _ROBOT)[1]:
-            self._odometry = TransformBuffer()  # the clock was set back
+            # The clock was set back: nothing that was stamped before says where the robot is now.
+            self._odometry, self._localised, self._pose = TransformBuffer(), TransformBuffer(), None
         self._odometry.set(_START, _ROBOT, stamp_s, RigidTransform.planar(*pose))
 
     def localised(self, frame: str, stamp_s: float, pose: tuple[float, float, float]) -> None:

@@ -27,8 +27,6 @@ from rcdsac_trl.robot.sectors import Sectors, check_switches
 
 # Places that the robot was at are kept so far apart, and so many of them: for a metre and a half.
 _TRAIL_STEP_M, _TRAIL_PLACES = 0.02, 75
-# What a policy needs to know around the robot: its stop zone reaches no farther.
-_NEARBY_M = 1.5
 # A detour is planned anew after so long, s; its corner gives way to the next within this, m.
 _REPLAN_S, _CORNER_M = 0.4, 0.3
 # Two waypoints nearer to each other are one, the goal.
@@ -243,7 +241,7 @@ class Navigator:
             return np.empty((0, 2))
         return self.static_layer.around(pose, reach_m)
 
-    def known(self, sectors: Sectors, pose: Pose | None) -> Sectors:
+    def known(self, sectors: Sectors, pose: Pose | None, reach_m: float) -> Sectors:
         """Return what a stop zone minds: what is seen, remembered where nothing is, or on the map.
 
         What walks is expected where its velocity has led it since it left the view.
@@ -251,12 +249,13 @@ class Navigator:
         Args:
             sectors: what the range sensor says.
             pose: as in :meth:`advise`.
+            reach_m: how far the stop zone looks; what the map shows farther away is left out.
         """
         remembered = np.concatenate([self._map.remembered, self._edges_of_movers()])
         unseen_m = self._nearest_m(seen_from(remembered, self._map.pose))
         known_m = np.where(sectors.covered, sectors.distances_m, unseen_m)
         # On the map is what no sensor sees, too.
-        known_m = np.minimum(known_m, self._nearest_m(self._on_map_within(_NEARBY_M, pose)))
+        known_m = np.minimum(known_m, self._nearest_m(self._on_map_within(reach_m, pose)))
         return replace(sectors, distances_m=known_m)
 
     def _edges_of_movers(self) -> NDArray[np.float64]:
@@ -268,7 +267,7 @@ class Navigator:
     def _nearest_m(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far the nearest of points in the robot's frame is, by sector, float64 [180]; ``inf``: none."""
         apart = np.hypot(points[:, 0], points[:, 1])
-        counts = (apart < _NEARBY_M) & (apart > self._robot.body_radius_m)
+        counts = apart > self._robot.body_radius_m
         bins = np.floor(np.arctan2(points[counts, 1], points[counts, 0]) / BIN_RAD).astype(np.intp) % NUM_BINS
         nearest_m = np.full(NUM_BINS, np.inf)
         np.minimum.at(nearest_m, bins, apart[counts])

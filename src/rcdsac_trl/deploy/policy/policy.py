@@ -39,14 +39,14 @@ if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.static_layer import Pose
 
 
-def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None, latency_s: float) -> Guard | None:
+def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> Guard | None:
     """Return the guard of a robot's policy.
 
     Raises:
         UserInputError: if the one that was given is another robot's.
     """
     if guard == "robot":
-        return Guard.of_late(robot, latency_s)
+        return Guard.of(robot)
     if not isinstance(guard, Guard | None):
         raise UserInputError(f"guard={guard!r} is none: give Guard.of(robot), None to drive without, or leave it out")
     if guard is not None and guard.robot != robot:
@@ -73,7 +73,7 @@ class Policy:
             the agent is on its own.
         acting: by the actor's mean or by the critics' choice among some actions; None: as the agent's config says.
         latency_s: from a measurement until the command that follows it acts, s. :meth:`act` then tells the agent what
-            it will meet by then, and the robot's own guard looks so much farther ahead.
+            it will meet by then, and the guard limits from where the robot will be.
 
     Attributes:
         config: what the agent is.
@@ -103,7 +103,7 @@ class Policy:
         self.measured = weights.measured
         self.robot = self.config.robot
         self._observer = RobotObserver(self.config, latency_s)
-        self.guard = _guard_of(self.robot, guard, latency_s)
+        self.guard = _guard_of(self.robot, guard)
         self.limits = limits
         self._latency_s = latency_s
         self.navigator = navigator
@@ -414,10 +414,14 @@ class Policy:
                 v, omega = self._advice.instead
                 told = ["it stood still and backs off; the agent drives on then"]
         if self.guard is not None:
-            wish = v, omega
-            v, omega, reason = self.guard.limit(*wish, self._known(sectors, on_map), measured, been)
-            if on_map is not None and reason and not self.guard.limit(*wish, self._known(sectors), measured, been)[2]:
-                reason += " around what the map shows"
+            wish, ahead = (v, omega), self._observer.ahead(measured, self._periods.time_s)
+            reach_m = self.guard.reach_m(abs(v), ahead)
+            known = self._known(sectors, on_map, reach_m)
+            v, omega, reason = self.guard.limit(*wish, known, measured, been, ahead)
+            if on_map is not None and reason:
+                unmapped = self._known(sectors, None, reach_m)
+                if not self.guard.limit(*wish, unmapped, measured, been, ahead)[2]:
+                    reason += " around what the map shows"
             if reason is not None:
                 told.insert(0, f"limited by {reason}; it ends when the cause does")
         # Networks are told what the robot was told: the limits are part of the world.
@@ -425,11 +429,11 @@ class Policy:
         quantiles, value, raw = outlook.quantiles, outlook.value, outlook.raw_quantiles
         return Command(v, omega, False, "; ".join(told) or None, outlook.wanted, quantiles, value, fresh, forgot, raw)
 
-    def _known(self, sectors: Sectors, on_map: "Pose | None" = None) -> Sectors:
+    def _known(self, sectors: Sectors, on_map: "Pose | None", reach_m: float) -> Sectors:
         """Return what the stop zone minds: what is sensed, and what the navigator knows besides."""
         if self.navigator is None:
             return sectors
-        return self.navigator.known(sectors, on_map)
+        return self.navigator.known(sectors, on_map, reach_m)
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""

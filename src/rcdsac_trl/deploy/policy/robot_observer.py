@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
-from rcdsac_trl.robot.latency import Latency, check_latency
+from rcdsac_trl.robot.latency import Ahead, Latency, at_once, check_latency
 from rcdsac_trl.robot.observation import AT_ORIGIN, range_observation, waypoint_observation
 from rcdsac_trl.robot.sectors import Sectors
 
@@ -57,6 +57,15 @@ class RobotObserver:
         if self._latency is not None:
             self._latency.note(command, at_s)
 
+    def ahead(self, measured: tuple[float, float], at_s: float) -> Ahead:
+        """Return where the robot will be when the command that follows a measurement begins to act.
+
+        Args:
+            measured: velocities, m/s and rad/s.
+            at_s: when they were measured, s; read where there is a latency.
+        """
+        return at_once(measured) if self._latency is None else self._latency.ahead(measured, at_s)
+
     def observe(
         self,
         sectors: Sectors,
@@ -77,7 +86,7 @@ class RobotObserver:
         bins = range_observation(sectors.distances_m, self.mask, self._robot.lidar.max_range_m)
         told, ahead = measured, None
         if self._latency is not None:
-            ahead = self._latency.ahead(measured, at_s)
+            ahead = self.ahead(measured, at_s)
             first, second = ahead.seen(np.array(waypoints)).tolist()
             waypoints, told = (tuple(first), tuple(second)), ahead.velocities
         vectors = [*waypoint_observation(AT_ORIGIN, *waypoints), *told, *self.commanded]

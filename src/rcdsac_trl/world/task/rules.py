@@ -1,7 +1,8 @@
 """The task: its settings, what the robot is paid, and the noise of its sensors, as pure functions.
 
 Everything here follows the paper's section "Reward"; nothing here holds state. Whoever steps the world calls these
-functions and keeps the state. What the robot is told and what its actions mean is :mod:`rcdsac_trl.robot.interface`.
+functions and keeps the state. What the robot is told is in :mod:`rcdsac_trl.robot.observation`, what its actions mean
+in :mod:`rcdsac_trl.robot.action`.
 """
 
 import math

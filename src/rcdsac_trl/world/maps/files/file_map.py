@@ -272,7 +272,7 @@ def _check_place(
 
 
 def check_file_maps(settings: FileMapSettings, min_path_m: float, robot_radius_m: float = ROBOT_RADIUS_M) -> None:
-    """Read all files and refuse those in which starts and goals cannot be drawn.
+    """Read all files and refuse those in which goals cannot be drawn, the first or the next.
 
     Args:
         settings: which files.
@@ -287,8 +287,6 @@ def check_file_maps(settings: FileMapSettings, min_path_m: float, robot_radius_m
     for file in files:
         building, floor = read_building(settings, file, robot_radius_m)
         _check_movers(settings, file, building)
-        if building.start is not None and building.goal is not None:
-            continue
         # The ends of the longest way: from any place one of them is at least half of it away.
         end, _ = farthest_cell(floor.connected, int(np.flatnonzero(floor.connected)[0]))
         _, length = farthest_cell(floor.connected, end)
