@@ -62,7 +62,7 @@ class Sheet:
         with Work(f"{counted(self.count, 'map')}, then their picture, {out}", self.count, "map") as work:
             maps = [make_map(source, self.split, self.seed, index) for index in range(self.count)]
             contact_sheet(maps, self.split, self.seed, drawn=work.end_unit).savefig(out, dpi=130)
-        print(f"drew {self.count} maps: {out}")
+        print(f"drew {counted(self.count, 'map')}: {out}")
         if self.json is not None:
             folder = Path(self.json)
             folder.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from rcdsac_trl.cli import entry_point, late
+from rcdsac_trl.config.command_line import SEARCHPATH, key_of
 
 if TYPE_CHECKING:
     from rcdsac_trl.training.trainer import Trainer
@@ -48,7 +49,9 @@ def main(cfg: DictConfig) -> None:
     from rcdsac_trl.training.setup import make_trainer
 
     job = HydraConfig.get()
-    _run(make_trainer(cfg, Path(job.runtime.output_dir), list(job.overrides.task)))
+    # Without the folders in which Hydra looked, nobody could read the others again.
+    looked_in = [override for override in job.overrides.hydra if key_of(override) == SEARCHPATH]
+    _run(make_trainer(cfg, Path(job.runtime.output_dir), [*looked_in, *job.overrides.task]))
 
 
 def _run(trainer: "Trainer") -> None:

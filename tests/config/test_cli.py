@@ -292,6 +292,8 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         ([RUN, "beta=[low]"], "beta=['low'] must be a number or a list of numbers in brackets or null"),
         ([RUN, "beta=-3"], "beta = -3 is outside the domain [-2, 0] of measure 'pow'"),
         ([RUN, "beta=[-1,-1.0]"], "beta=-1 is given more than once"),
+        ([RUN, "beta=[-1,-1.0000000001]"], "beta=-1 is given more than once"),
+        (["baseline=dwa", "sampled=true"], "baseline=dwa has no actions to be drawn: leave sampled out"),
         ([RUN, "beta=[-1]", "collision_weight=[1]"], "rcdsac_pow has no collision weight: leave collision_weight out"),
         ([RUN, "beta=[-1]", "sensor=sparse"], "sensor=sparse is not what "),
         ([RUN, "beta=[-1]", "checkpoint=first"], "checkpoint=first must be one of best, last"),

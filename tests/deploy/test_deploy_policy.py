@@ -125,6 +125,27 @@ def test_many_actions_at_once_are_expected_what_each_is_alone(row: str) -> None:
     assert len(np.unique(many.mean(axis=1))) == 7
 
 
+@pytest.mark.parametrize("actions", [[[0.0, 0.0, 0.0]], [0.0, 0.0], [[0.0, 1.5]], [[0.0, np.nan]], None])
+def test_what_are_no_actions_is_refused(actions: Any) -> None:
+    policy = Policy(agent())
+    policy.act(OPEN, AHEAD, STANDING)
+    with pytest.raises(UserInputError, match=r"^actions"):
+        policy.outlooks(actions)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"navigator": "x"}, "^navigator='x' is none: give Navigator"),
+        ({"acting": "x"}, "^acting='x' is none: give ActingSettings"),
+        ({"limits": None}, "^limits=None are none: give InputLimits"),
+    ],
+)
+def test_what_is_none_of_what_it_should_be_is_refused(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(UserInputError, match=told):
+        Policy(agent(), **given)
+
+
 def test_nothing_is_expected_of_actions_before_anything_was_seen() -> None:
     with pytest.raises(UserInputError, match="nothing was seen"):
         Policy(agent()).outlooks(np.zeros((1, 2), np.float32))

@@ -356,3 +356,16 @@ def test_the_stop_zone_minds_what_the_navigator_remembers(monkeypatch: pytest.Mo
 def test_what_navigates_nowhere_is_refused(make: Any, bad: dict[str, Any]) -> None:
     with pytest.raises(UserInputError, match=f"{next(iter(bad))}="):
         make(**bad)
+
+
+def test_what_is_no_navigator_of_this_robot_is_refused() -> None:
+    for watchdog in (True, False):
+        with pytest.raises(UserInputError, match=rf"^watchdog={watchdog} of a navigator is no WatchdogSettings"):
+            NavigatorSettings(watchdog=watchdog)  # type: ignore[arg-type]
+    policy = Policy(agent())
+    other = Navigator(robot=replace(PAPER, name="cart", radius_m=0.4))
+    with pytest.raises(UserInputError, match=r"^the navigator is of robot=cart, and this agent drives robot=paper"):
+        policy.navigator = other
+    assert policy.navigator is None
+    policy.navigator = Navigator()
+    assert copy.copy(policy).navigator is not policy.navigator

@@ -16,7 +16,7 @@ from rcdsac_trl.report.course_claims import course_claims, judged_course_claims
 from rcdsac_trl.report.course_table import paper_course
 from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.read_course import read_courses
-from rcdsac_trl.report.statistics import Array, Interval
+from rcdsac_trl.report.statistics import Array, Interval, Term, contrast
 from rcdsac_trl.report.table import paper_table
 from rcdsac_trl.report.verdict_words import as_table, evidence, missing, numbers, of_agents, over, tally
 from rcdsac_trl.report.verdicts import Cell, Claim, Finding, Group, Measured, Verdict, find, judge, than
@@ -124,6 +124,14 @@ def test_all_and_any() -> None:
     assert against_three(3.0, 3.0, 1.95, quantifier="any").verdict == Verdict.OPEN
     assert numbers(against_three(1.0, 1.0, 3.0)).startswith("3 comparisons: 2 as claimed, 1 not so. Weakest: d: 3.00")
     assert "Strongest: b: 1.00" in numbers(against_three(1.0, 1.95, 3.0, quantifier="any"))
+
+
+def test_one_map_decides_nothing() -> None:
+    fewer, more = np.zeros((1, 1, 5)), np.ones((1, 1, 5))
+    found = contrast([Term(1.0, fewer, "a"), Term(-1.0, more, "b")])
+    assert (found.value, np.isnan(found.low), np.isnan(found.high)) == (-1.0, True, True)
+    for expected in ("less", "more", "comparable"):
+        assert judge(found, expected, 0.05) == Verdict.OPEN  # type: ignore[arg-type]
 
 
 def test_the_weakest_is_the_one_that_decides() -> None:

@@ -222,6 +222,17 @@ def test_seeds_of_an_agent_that_act_differently_are_not_averaged(tmp_path: Path)
     assert len(read_episodes([chooses, other]).conditions) == 2
 
 
+def test_whole_betas_are_compared_without_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A CSV file of whole numbers alone holds no floats; warnings are errors here."""
+    monkeypatch.setattr(statistics, "DRAWS", 2000)
+    folder = evaluate(tmp_path / "pow", "rcdsac_pow", {-2.0: 0, -1.0: 1})
+    rows = pd.read_csv(folder / "episodes.csv").astype({"beta": int})
+    rows.to_csv(folder / "episodes.csv", index=False)
+    shown = table.comparison(read_episodes([folder]))
+    assert shown[("", "β or weight")].tolist() == ["-2", "-1"]
+    assert (shown[("narrow", "collisions, paper")] != "").all()
+
+
 def test_seeds_of_an_agent_that_have_other_risk_measures_are_not_averaged(tmp_path: Path) -> None:
     power = evaluate(tmp_path / "power", "rcdsac_pow", {-1.0: 0}, measure="pow")
     wang = evaluate(tmp_path / "wang", "rcdsac_pow", {-1.0: 2}, train_seed=1, measure="wang")

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -72,19 +73,34 @@ def test_an_agent_is_told_in_a_simulation_what_it_is_told_on_a_robot() -> None:
         observer.note((float(rng.uniform(-0.2, 0.6)), float(rng.uniform(-1.5, 1.5))), PERIOD_S * step)
 
 
-def test_a_policy_allows_for_it_and_so_does_its_own_guard() -> None:
+def test_a_policy_allows_for_it_and_so_does_its_guard() -> None:
     weights = agent(memory_s=MEMORY_S, range_code="nearness")
     late, prompt = Policy(weights, latency_s=LATENCY_S), Policy(weights)
     assert late.latency_s == LATENCY_S
-    assert late.guard == Guard(reaction_s=0.25 + LATENCY_S)
     wanted = [[policy.act(OPEN, AHEAD, [0.3, 0.2], -1.0).wanted for _ in range(3)] for policy in (late, prompt)]
     assert wanted[0] != wanted[1]
     late.reset()
     assert [late.act(OPEN, AHEAD, [0.3, 0.2], -1.0).wanted for _ in range(3)] == wanted[0]
     with pytest.raises(AttributeError):
         late.latency_s = 0.1  # type: ignore[misc]
-    own = Guard(margin_m=0.1)
-    assert Policy(weights, latency_s=LATENCY_S, guard=own).guard == own
+
+
+def test_whichever_guard_it_is_it_limits_from_where_the_robot_will_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = []
+
+    def limit(self: Guard, v: float, omega: float, *rest: Any) -> tuple[float, float, None]:
+        begun.append(rest[-1])
+        return v, omega, None
+
+    monkeypatch.setattr(Guard, "limit", limit)
+    weights = agent(memory_s=MEMORY_S, range_code="nearness")
+    for guard in (Guard(), Guard(margin_m=0.1)):
+        late, prompt = (Policy(weights, guard=guard, latency_s=latency_s) for latency_s in (LATENCY_S, 0.0))
+        for policy in (late, prompt):
+            policy.act(OPEN, AHEAD, [0.5, 0.0], -1.0)
+        there, here = begun[-2:]
+        assert there.pose[0] == pytest.approx(0.5 * LATENCY_S)  # no command is under way: it goes on as it moves
+        assert here == ((0.0, 0.0, 0.0), (0.5, 0.0), 0.0)
 
 
 def test_who_remembers_nothing_or_is_given_observations_is_refused() -> None:

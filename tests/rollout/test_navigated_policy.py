@@ -3,6 +3,7 @@
 import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,7 +21,7 @@ from rcdsac_trl.robot.compiled_guard import CompiledGuard
 from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation, waypoint_positions
 from rcdsac_trl.robot.range_sensor import sensor_mask
-from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.robot.sectors import Sectors
 from rcdsac_trl.rollout.navigation import NavigatedPolicy, navigator_of
 from rcdsac_trl.world.sim.lidar import sector_distances
@@ -170,19 +171,20 @@ def test_a_stop_zone_stands_behind_a_baseline_and_has_a_folder_of_its_own(
     assert collisions[1] == 0
 
 
-def test_the_stop_zone_of_agents_that_allow_for_a_latency_looks_so_much_farther(
+def test_the_stop_zone_of_agents_that_allow_for_a_latency_begins_where_they_will_be(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, _, _ = untrained_run(tmp_path / "run", "sac", "sensor.memory_s=5", "network.range_code=nearness")
-    made = []
+    begun = []
 
-    def of(robot: RobotSettings, **changes: float) -> Guard:
-        made.append(changes)
-        return Guard.of(robot, **changes)
+    def limit(self: Guard, v: float, omega: float, *rest: Any) -> tuple[float, float, None]:
+        begun.append(rest[-1])
+        return v, omega, None
 
-    monkeypatch.setattr(CompiledGuard, "of", of)
+    monkeypatch.setattr(CompiledGuard, "limit", limit)
     evaluate(f"run={run}", "checkpoint=last", "latency_s=0.28", ZONE)
-    assert made == [{"reaction_s": pytest.approx(0.25 + 0.28)}]
+    assert {ahead.latency_s for ahead in begun} == {0.28}
+    assert len({ahead.pose for ahead in begun}) > len(begun) / 2
 
 
 def test_who_is_not_told_how_long_a_step_takes_refuses() -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_checkpoint import DAMAGE
 from torchrl.checkpoint import Checkpoint
@@ -23,9 +24,11 @@ from torchrl.checkpoint import Checkpoint
 import killable
 from forked import Forked
 from rcdsac_trl import train
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint_record import Progress, folders, newest
 from rcdsac_trl.system.invocation import program
+from rcdsac_trl.training.resume import run_to_continue
 from rcdsac_trl.training.run_folder import cut, lengths
 from rcdsac_trl.training.setup import resume_training
 from tiny import TINY, tiny_trainer
@@ -440,6 +443,28 @@ def test_a_folder_is_continued_as_it_was_started(command: Any, copied: Path, sho
     assert_equal_runs(copied, short)
     assert set(tmp_path.iterdir()) == before
     assert len(pd.read_csv(copied / "training_episodes.csv")) == 6
+
+
+def test_a_run_of_a_robot_in_a_folder_of_ones_own_goes_on(
+    command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine" / "robot").mkdir(parents=True)
+    (tmp_path / "mine" / "robot" / "cart.yaml").write_text("defaults: [paper, _self_]\nname: cart\nradius_m: 0.3\n")
+    own = [f"hydra.searchpath=[{tmp_path / 'mine'}]", "+algo=sac", "robot=cart"]
+    begun = []
+    monkeypatch.setattr("rcdsac_trl.training.setup.make_trainer", lambda *given: begun.append(given) or sys.exit(7))
+    with pytest.raises(SystemExit, match="7"):
+        command([*own, f"hydra.run.dir={tmp_path / 'run'}"])
+    ((cfg, _, noted),) = begun
+    assert noted == own
+    run = tmp_path / "run"
+    run.mkdir(exist_ok=True)
+    OmegaConf.save(cfg, run / "config.yaml")
+    (run / "manifest.json").write_text(json.dumps({"overrides": noted}))
+    for more in ([], own, own[:1], ["robot=cart"], ["seed=0"]):
+        assert run_to_continue([f"resume={run}", *more]) == run
+    with pytest.raises(UserInputError, match=r"^robot\.max_turn_deg_per_s=60 is not what .* was started with"):
+        run_to_continue([f"resume={run}", "robot.max_turn_deg_per_s=60"])
 
 
 @pytest.mark.parametrize(

@@ -371,6 +371,10 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda path: with_header(path, mode="cubic"),
         "mode=cubic is unknown: it must be one of trinary, scale, raw",
     ),
+    "yaw in degrees": (
+        lambda path: with_header(path, origin=[1.0, 2.0, 90]),
+        r"the yaw of origin, 90, is more than two turns: give radians",
+    ),
     "origin": (lambda path: with_header(path, origin=[1.0, 2.0]), r"origin is \[1\.0, 2\.0\], not three numbers"),
     "missing image": (lambda path: with_header(path, image="b.pgm"), r"its image .*b\.pgm does not exist"),
     "no image": (

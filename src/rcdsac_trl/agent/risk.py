@@ -363,6 +363,9 @@ def make_measure(name: str, low: float | None = None, high: float | None = None)
         PowerLaw(low=-1.5, high=0.0)
     """
     if name not in MEASURES:
-        raise UserInputError(f"there is no risk measure {name!r}: choose one of {', '.join(MEASURES)}")
+        raise UserInputError(
+            f"there is no risk measure {name!r}: choose one of {', '.join(MEASURES)}, or add yours to MEASURES "
+            "(docs/tutorials/own-measure.md)"
+        )
     given = {key: value for key, value in (("low", low), ("high", high)) if value is not None}
     return MEASURES[name](**given)

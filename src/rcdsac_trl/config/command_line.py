@@ -9,6 +9,9 @@ from pathlib import Path
 
 from rcdsac_trl.errors import UserInputError
 
+SEARCHPATH = "hydra.searchpath"
+"""Says in which folders of a user's own Hydra looks for configs."""
+
 # Where a path may begin in a value is behind the key, in a list, behind a quote; a variable may be any part of it.
 _HOME = re.compile(r"""(?<=[=\[,'"])~(?P<user>[\w.-]*)(?=[/,\]'"]|$)""")
 # What neither a shell nor Hydra reads as its own.

@@ -16,7 +16,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.config.command_line import assigned, key_of, listed, several, unreadable
+from rcdsac_trl.config.command_line import SEARCHPATH, assigned, key_of, listed, several, unreadable
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.typed import unknown_key
 from rcdsac_trl.errors import UserInputError, first_line
@@ -100,7 +100,7 @@ def _compose(config_name: str, overrides: list[str], *, return_hydra_config: boo
     for override in overrides:
         if not key_of(override).partition("@")[0].strip():  # Hydra fails an assertion
             raise UserInputError(f"{override} names no key: write it as <key>=<value>, without spaces around =")
-        if key_of(override) == "hydra.searchpath":
+        if key_of(override) == SEARCHPATH:
             _check_searchpath(override)
     overrides = with_sections(config_name, overrides)
     with _initialized():

@@ -34,7 +34,8 @@ class Condition:
 
 
 def check_unique(conditions: list[Condition]) -> None:
-    """Refuse to measure the same thing twice, which would shrink the apparent spread."""
+    """Refuse to measure the same thing twice, which would shrink the apparent spread, or what tables would not tell."""
+    names = [str(condition) for condition in conditions]
     for condition in conditions:
-        if conditions.count(condition) > 1:
+        if names.count(str(condition)) > 1:
             raise UserInputError(f"{condition} is given more than once: name every value once")

@@ -142,6 +142,7 @@ class EvaluationSettings:
             "does not allow for a latency: leave latency_s out": self.latency_s,
             "has no weights to be rounded: leave half_precision out": self.half_precision,
             "has no checkpoints: leave checkpoint out": self.checkpoint,
+            "has no actions to be drawn: leave sampled out": self.sampled,
             "has no critics to choose by: leave acting out": self.acting.given,
             "has no beta to turn: leave beta_controller out": self.beta_controller,
         }

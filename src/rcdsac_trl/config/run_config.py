@@ -156,7 +156,9 @@ def _of_file(path: Path, reader: Callable[[dict[str, Any]], Settings]) -> Settin
         return reader(_completed(plain(cfg)))
     except (OSError, ValueError, TypeError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())
-        raise UserInputError(f"{path} cannot be read ({reason}): name a folder that this version wrote") from error
+        raise UserInputError(
+            f"{path} cannot be read ({reason}): mend that, or name a folder that this version wrote"
+        ) from error
 
 
 def _completed(values: dict[str, Any]) -> dict[str, Any]:

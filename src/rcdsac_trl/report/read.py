@@ -107,6 +107,10 @@ def read_evaluation(folder: Path) -> Evaluation:
         raise UserInputError(f"{folder} cannot be read ({error}): evaluate again into another folder") from error
     if missing:
         raise UserInputError(f"{folder} does not say {', '.join(sorted(missing))}: evaluate again with this version")
+    # CSV files of whole numbers alone hold no floats.
+    episodes = episodes.astype({"beta": float, "collision_weight": float})
+    if collisions is not None:
+        collisions = collisions.astype({"beta": float, "collision_weight": float})
     if "beta_controller" not in episodes:  # nothing turned beta
         episodes = episodes.assign(beta_controller=None, mean_beta=episodes["beta"])
     if collisions is not None and "beta_controller" not in collisions:

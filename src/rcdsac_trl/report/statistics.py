@@ -247,6 +247,9 @@ def contrast(terms: Sequence[Term], confidence: float = CONFIDENCE) -> Interval:
         terms: at least one, all with the same maps.
         confidence: of the interval.
 
+    Returns:
+        Bounds are NaN where one map was driven.
+
     Example:
         >>> averse, bold = np.array([[[0.0], [2.0]]]), np.array([[[1.0], [3.0]]])
         >>> contrast([Term(1.0, averse, "a"), Term(-1.0, bold, "a")])
@@ -256,6 +259,8 @@ def contrast(terms: Sequence[Term], confidence: float = CONFIDENCE) -> Interval:
     by_map = by_map[np.isfinite(by_map)]  # a map on which a term was never measured says nothing
     if not len(by_map):
         return Interval(float("nan"), float("nan"), float("nan"))
+    if len(by_map) < 2:  # of how others differ, one map says nothing
+        return Interval(float(by_map.mean()), float("nan"), float("nan"))
     chosen, _ = _resamples(len(by_map), DRAWS, PERMUTATIONS)
     # A setting that fewer seeds were driven at is apart from the others of its agent: whose they are is not known.
     of_trainings: defaultdict[tuple[str, int], Array] = defaultdict(lambda: np.zeros(1))

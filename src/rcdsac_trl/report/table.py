@@ -45,7 +45,8 @@ def own_table(episodes: Episodes) -> pd.DataFrame:
             values = episodes.of(condition, metric)
             found = bootstrap(values).within(*possible(metric))
             row |= {f"{metric}_mean": found.value, f"{metric}_std": np.nanstd(values)}
-            row |= {f"{metric}_low": found.low, f"{metric}_high": found.high}
+            bounds = (found.low, found.high) if values.shape[1] > 1 else (np.nan, np.nan)  # one map tells none
+            row |= dict(zip((f"{metric}_low", f"{metric}_high"), bounds, strict=True))
         rows.append(row)
     return pd.DataFrame(rows).merge(_names(), on="agent", how="left")
 

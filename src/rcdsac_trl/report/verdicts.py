@@ -240,7 +240,7 @@ def judge(interval: Interval, expected: Expected, margin: float) -> Verdict:
         'cannot be told'
     """
     low, high = interval.low, interval.high
-    if np.isnan(interval.value):
+    if np.isnan(low):  # nothing was measured, or one map, which says nothing of others
         return Verdict.OPEN
     if expected == "more":
         low, high = -high, -low

@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+MOST_YAW_RAD = 4.0 * math.pi
+"""A yaw of more than two turns is not in radians."""
+
 
 def placed(points: NDArray[np.float64], pose: Any) -> NDArray[np.float64]:
     """Return points of a robot's frame in the frame of its pose.

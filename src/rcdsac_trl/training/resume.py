@@ -8,7 +8,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from rcdsac_trl.config.command_line import assigned, folder_of, key_of
+from rcdsac_trl.config.command_line import SEARCHPATH, assigned, folder_of, key_of
 from rcdsac_trl.config.compose import compose, output_folder
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import CHECKPOINTS, CONFIG_NAME, settings_of_new_run, settings_of_run
@@ -36,15 +36,16 @@ def run_to_continue(overrides: list[str]) -> Path | None:
     """
     if not any(key_of(override) == "resume" for override in overrides):
         return None
-    cfg = compose("train", overrides)
-    if cfg.resume is None:
+    # By itself: what else is given may need what the run was started with, such as folders of robots.
+    resume = compose("train", [override for override in overrides if key_of(override) == "resume"]).resume
+    if resume is None:
         return None
-    if cfg.resume == "":
+    if resume == "":
         raise UserInputError("resume names no folder: give it one, or auto, or leave it out")
-    if cfg.resume == AUTO:
-        settings_of_new_run(cfg)
+    if resume == AUTO:
+        settings_of_new_run(compose("train", overrides))
         return _newest_unfinished(overrides)
-    folder = Path(str(cfg.resume))
+    folder = Path(str(resume))
     settings_of_run(folder, key="resume")
     _check_overrides(folder, overrides)
     return folder
@@ -93,7 +94,7 @@ def _check_overrides(folder: Path, overrides: list[str]) -> None:
     own = _own_overrides(folder)
     for override in overrides:
         key = key_of(override)
-        if override in own or key == "resume":
+        if override in own or key in ("resume", SEARCHPATH):  # the run's config holds, wherever others may lie
             continue
         if key == "hydra.run.dir" and folder_of(override).resolve() == folder.resolve():
             continue

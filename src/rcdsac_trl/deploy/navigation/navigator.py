@@ -61,6 +61,11 @@ class NavigatorSettings:
     def __post_init__(self) -> None:
         """Refuse what remembers nothing."""
         check_switches(self, "replan")
+        if not isinstance(self.watchdog, WatchdogSettings | None):
+            raise UserInputError(
+                f"watchdog={self.watchdog!r} of a navigator is no WatchdogSettings(..): give that, None for none, or "
+                "NavigatorSettings.switched(replan=True, watchdog=True)"
+            )
         for name, low in (("blocked_s", 0.0), ("memory_s", 0.1)):
             if not low <= getattr(self, name) < math.inf:
                 raise UserInputError(f"{name}={getattr(self, name)} of a navigator must be at least {low:g} seconds")
@@ -100,6 +105,11 @@ class Navigator:
         robot: that the agent drives.
         static_layer: what a map shows; None: it knows what was seen alone.
 
+    Attributes:
+        settings: as given.
+        robot: likewise.
+        static_layer: likewise; it may be changed.
+
     Example:
         >>> navigator = Navigator(NavigatorSettings(blocked_s=0.0))
         >>> ranges_m = np.full(180, np.inf)
@@ -118,13 +128,13 @@ class Navigator:
     ) -> None:
         self.settings = settings
         self.static_layer = static_layer
-        self._robot = robot
+        self.robot = robot
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: the robot was put somewhere else, or has a new task."""
         nothing = np.zeros(NUM_BINS, np.bool_)
-        max_range_m = self._robot.lidar.max_range_m
+        max_range_m = self.robot.lidar.max_range_m
         self._map = LocalMap(LocalMapSettings(memory_s=self.settings.memory_s), nothing, max_range_m)
         self._tracks = MoverTracks(TrackSettings(), nothing, max_range_m)
         self._trail: deque[Place] = deque(maxlen=_TRAIL_PLACES)
@@ -133,7 +143,7 @@ class Navigator:
         self._blocked_s = self._planned_s = 0.0
         self._detour: list[Place] = []
         settings = self.settings.watchdog
-        self._watchdog = None if settings is None else Watchdog(settings, self._robot)
+        self._watchdog = None if settings is None else Watchdog(settings, self.robot)
 
     def advise(
         self,
@@ -191,7 +201,7 @@ class Navigator:
 
     def _waypoints(self, waypoints: tuple[Place, Place], elapsed_s: float) -> tuple[Place, Place]:
         """Return the next two waypoints, of a detour where the way to the first is blocked."""
-        radius_m = self._robot.circumradius_m
+        radius_m = self.robot.circumradius_m
         target, after = self._placed(waypoints[0]), self._placed(waypoints[1])
         known = [self._map.clearances, *([] if self._far is None else [self._far])]
         if all(is_clear(clearances, self._map.place, target, radius_m) for clearances in known):
@@ -217,7 +227,7 @@ class Navigator:
         Where there is none, or the robot is beside it and it still is the next one, they lead to the one after it.
         """
         clearances = self._map.clearances if self._far is None else self._far
-        here, radius_m = self._map.place, self._robot.circumradius_m
+        here, radius_m = self._map.place, self.robot.circumradius_m
         corners = plan_detour(clearances, here, target, radius_m)
         arrived = bool(corners) and corners[-1] != target and math.dist(corners[-1], here) < _CORNER_M
         if (arrived or not corners) and math.dist(target, after) > _SAME_M:
@@ -267,7 +277,7 @@ class Navigator:
     def _nearest_m(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far the nearest of points in the robot's frame is, by sector, float64 [180]; ``inf``: none."""
         apart = np.hypot(points[:, 0], points[:, 1])
-        counts = apart > self._robot.body_radius_m
+        counts = apart > self.robot.body_radius_m
         bins = np.floor(np.arctan2(points[counts, 1], points[counts, 0]) / BIN_RAD).astype(np.intp) % NUM_BINS
         nearest_m = np.full(NUM_BINS, np.inf)
         np.minimum.at(nearest_m, bins, apart[counts])

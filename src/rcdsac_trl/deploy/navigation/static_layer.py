@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.planar import placed, seen_from
+from rcdsac_trl.robot.planar import MOST_YAW_RAD, placed, seen_from
+from rcdsac_trl.robot.sectors import is_finite_number
 
 Pose = tuple[float, float, float]
 
@@ -92,12 +93,16 @@ class StaticLayer:
                 f"cells of a map are {occupied.dtype} {list(occupied.shape)}: say of each whether it is occupied, bool "
                 "[h, w], such as grid >= 65"
             )
-        if not 0.0 < cell_m <= _LARGEST_CELL_M:
+        if not (is_finite_number(cell_m) and 0.0 < cell_m <= _LARGEST_CELL_M):
             raise UserInputError(
-                f"cells of a map have a side of {cell_m:g}: give metres, above 0, {_LARGEST_CELL_M:g} at most"
+                f"cells of a map have a side of {cell_m}: give metres, above 0, {_LARGEST_CELL_M:g} at most"
             )
-        if not all(map(math.isfinite, origin)):
-            raise UserInputError(f"the origin of a map, {origin}, is not finite: give x and y in m and yaw in rad")
+        numbers = numbers_of(origin, "the origin of a map")
+        if numbers.shape != (3,) or not np.isfinite(numbers).all() or abs(numbers[2]) > MOST_YAW_RAD:
+            raise UserInputError(
+                f"the origin of a map, {origin}, is not three finite numbers: give x and y in m and yaw in rad, two "
+                "turns at most"
+            )
         padded = np.pad(occupied, 1)
         # A side between two cells is an edge where one alone is occupied; corners are counted in cells.
         below = np.argwhere(padded[1:] != padded[:-1]) - (0, 1)

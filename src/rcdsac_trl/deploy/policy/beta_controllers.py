@@ -96,7 +96,8 @@ class ClearanceBeta:
 
     def __call__(self, distances_m: Array, quantiles: Array | None) -> float:
         """Return beta; see :class:`BetaController`."""
-        return float(np.interp(distances_m[self._mask].min(), self._limits_m, self._betas))
+        nearest_m = np.fmin.reduce(np.asarray(distances_m, np.float64)[self._mask], initial=np.inf)  # NaN says nothing
+        return float(np.interp(nearest_m, self._limits_m, self._betas))
 
 
 def lower_tail_variance(quantiles: Array) -> float:

@@ -47,6 +47,8 @@ def observed(observation: Any, config: AgentConfig) -> Observed:
             raise UserInputError(
                 f"{key} is of agents {array.shape[:-1]}, and {_RANGE} of {batch}: give what one step returned"
             )
+    if 0 in batch:
+        raise UserInputError(f"the observation is of no agent (batch {list(batch)}): give one agent's or more")
     flat = {key: array.reshape(-1, array.shape[-1]) for key, array in arrays.items()}
     bins = flat.pop(_RANGE)
     if np.any(bins[:, ~config.sensor_mask]):

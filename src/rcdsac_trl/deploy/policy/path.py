@@ -10,7 +10,7 @@ from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.polyline import Polyline, corners
 from rcdsac_trl.deploy.sensors.arrays import numbers_of
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.planar import seen_from
+from rcdsac_trl.robot.planar import MOST_YAW_RAD, seen_from
 from rcdsac_trl.robot.sectors import is_finite_number
 
 # Waypoints are at most this far ahead along the path: the maps of training are 20 m wide.
@@ -19,7 +19,6 @@ _LOOK_AHEAD_M = 20.0
 _FARTHEST_M = 75.0
 # Beyond these, a path is not in metres, nor a pose; projected coordinates of maps have seven digits.
 _LONGEST_LEG_M, _LONGEST_PATH_M, _LARGEST_COORDINATE_M = 500.0, 20_000.0, 1e8
-_LARGEST_YAW_RAD = 4.0 * math.pi
 # A path that is thinned more than this cuts through what stands beside it.
 _LARGEST_TOLERANCE_M = 1.0
 # A robot that is farther from where it was on its path was carried away, and begins anew at the nearest place.
@@ -272,6 +271,6 @@ def checked_pose(pose: Any) -> tuple[float, float, float]:
     x, y, yaw = numbers.tolist()
     if max(abs(x), abs(y)) > _LARGEST_COORDINATE_M:
         raise UserInputError(f"the pose's x={x:g}, y={y:g} are on no map: give metres")
-    if abs(yaw) > _LARGEST_YAW_RAD:
+    if abs(yaw) > MOST_YAW_RAD:
         raise UserInputError(f"the pose's yaw={yaw:g} is more than two turns: give radians, from -pi to pi")
     return x, y, yaw

@@ -57,6 +57,25 @@ def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> G
     return guard
 
 
+def _navigator_of(robot: RobotSettings, navigator: "Navigator | None") -> "Navigator | None":
+    """Return the navigator of a robot's policy.
+
+    Raises:
+        UserInputError: if the one that was given is none, or another robot's.
+    """
+    if navigator is None:
+        return None
+    of = getattr(navigator, "robot", None)  # its class takes numba to import
+    if not isinstance(of, RobotSettings):
+        raise UserInputError(f"navigator={navigator!r} is none: give Navigator(NavigatorSettings(), policy.robot)")
+    if of != robot:
+        raise UserInputError(
+            f"the navigator is of robot={of.name}, and this agent drives robot={robot.name}: give "
+            "Navigator(NavigatorSettings(), policy.robot)"
+        )
+    return navigator
+
+
 class Policy:
     """A trained agent that drives a robot.
 
@@ -84,8 +103,8 @@ class Policy:
             None for an agent that is told none.
 
     Raises:
-        UserInputError: if the guard is another robot's, the critics are to choose by a measure of your own, or the
-            latency cannot be allowed for.
+        UserInputError: if guard or navigator is another robot's, the critics are to choose by a measure of your own,
+            the latency cannot be allowed for, or something is none of what it should be.
     """
 
     def __init__(
@@ -104,6 +123,8 @@ class Policy:
         self.robot = self.config.robot
         self._observer = RobotObserver(self.config, latency_s)
         self.guard = _guard_of(self.robot, guard)
+        if not isinstance(limits, InputLimits):
+            raise UserInputError(f"limits={limits!r} are none: give InputLimits(..), or leave them out")
         self.limits = limits
         self._latency_s = latency_s
         self.navigator = navigator
@@ -130,11 +151,24 @@ class Policy:
     def __copy__(self) -> "Policy":
         """Copy the situation, and share what never changes."""
         copied = object.__new__(type(self))
-        own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_observer", "navigator")}
+        own = {name: copy.deepcopy(self.__dict__[name]) for name in ("_observer", "_navigator")}
         own |= {name: copy.copy(self.__dict__[name]) for name in ("_networks", "_periods")}
         own["_others"] = [copy.copy(other) for other in self._others]
         copied.__dict__ |= self.__dict__ | own
         return copied
+
+    @property
+    def navigator(self) -> "Navigator | None":
+        """What navigates around the agent; it may be changed.
+
+        Raises:
+            UserInputError: if another robot's is given.
+        """
+        return self._navigator
+
+    @navigator.setter
+    def navigator(self, navigator: "Navigator | None") -> None:
+        self._navigator = _navigator_of(self.robot, navigator)
 
     @property
     def acting(self) -> ActingSettings:
@@ -283,11 +317,15 @@ class Policy:
             Quantiles of the return at :attr:`fractions`, float32 [K, N]; of critics that know the mean alone, [K, 1].
 
         Raises:
-            UserInputError: if nothing was seen since :meth:`reset`, or `beta` is refused by :meth:`act`, too.
+            UserInputError: if nothing was seen since :meth:`reset`, `beta` is refused by :meth:`act`, too, or `actions`
+                are none.
         """
         self._check_seen()
         context = self.check_beta(beta)
-        return self._networks.outlooks(np.asarray(actions, np.float32), context)
+        asked = numbers_of(actions, "actions").astype(np.float32)
+        if asked.ndim != 2 or asked.shape[1] != 2 or not np.all(np.abs(asked) <= 1.0):
+            raise UserInputError(f"actions={actions} are not [K, 2] numbers from -1 to 1: give u_0 and u_1 of each")
+        return self._networks.outlooks(asked, context)
 
     def _check_seen(self) -> None:
         """Refuse to say what is expected where nothing was seen."""

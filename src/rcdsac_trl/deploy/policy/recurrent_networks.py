@@ -9,6 +9,7 @@ from rcdsac_trl.deploy.policy.action_choice import ActionChoice
 from rcdsac_trl.deploy.policy.command import Outlook
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics, Encoders
 from rcdsac_trl.deploy.policy.weights import Weights
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
 
 
@@ -55,6 +56,8 @@ class RecurrentNetworks:
 
     @acting.setter
     def acting(self, acting: ActingSettings) -> None:
+        if not isinstance(acting, ActingSettings):
+            raise UserInputError(f"acting={acting!r} is none: give ActingSettings(..)")
         self._choice = ActionChoice(acting, self._config, self._actor, self._critics) if acting.chooses else None
         self._acting = acting
         # Offsets were fitted while it acted as its config says: acting otherwise it earns something else.

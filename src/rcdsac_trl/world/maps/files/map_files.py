@@ -26,7 +26,8 @@ def map_files(path: str | Sequence[str] | None) -> list[Path]:
                 raise UserInputError(f"map.path={name} is a folder without a map: one ends in {', '.join(SUFFIXES)}")
             files += sorted(of_folder, key=_by_numbers)
         elif not Path(name).is_file():
-            raise UserInputError(f"map.path={name} does not exist: name a file or a folder")
+            seen = "" if Path(name).is_absolute() else f" in {Path.cwd()}"
+            raise UserInputError(f"map.path={name} does not exist{seen}: name a file or a folder")
         elif Path(name).suffix.lower() not in SUFFIXES:
             hint = ": name the YAML file that belongs to it" if Path(name).suffix.lower() in (".pgm", ".png") else ""
             raise UserInputError(f"map.path={name} is no map, which ends in {', '.join(SUFFIXES)}{hint}")

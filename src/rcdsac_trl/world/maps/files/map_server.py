@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.planar import MOST_YAW_RAD
 from rcdsac_trl.world.maps.files.floor_plan import FloorPlan, plan_of_cells
 
 Unknown = Literal["occupied", "free"]
@@ -68,6 +69,8 @@ def read_map_server(path: Path, unknown: Unknown, *, mapped: bool) -> FloorPlan:
     if not isinstance(origin, list) or len(origin) != 3:
         raise UserInputError(f"{path}: origin is {origin!r}, not three numbers [x, y, yaw]")
     x, y, yaw = (_number(path, {"origin": value}, "origin", None, -1e6, 1e6) for value in origin)
+    if abs(yaw) > MOST_YAW_RAD:
+        raise UserInputError(f"{path}: the yaw of origin, {yaw:g}, is more than two turns: give radians")
     occupancy = _occupancy(image_of(path), mode, negate)
     between = np.isnan(occupancy) if mode != "trinary" else np.isnan(occupancy) | (occupancy >= free_at)
     occupied = occupancy > occupied_at if mode == "trinary" else occupancy > 0.5 * (free_at + occupied_at)
