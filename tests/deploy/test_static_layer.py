@@ -76,8 +76,8 @@ def test_only_what_is_near_is_told() -> None:
     [
         (lambda: StaticLayer(np.zeros((3, 3))), "not finite numbers"),
         (lambda: StaticLayer(np.array([[math.nan, 0.0]])), "not finite numbers"),
-        (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 0.0, AT_ORIGIN), "side of 0: give metres"),
-        (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 50.0, AT_ORIGIN), "side of 50: give metres"),
+        (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 0.0, AT_ORIGIN), "side of 0.0: give metres"),
+        (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 50.0, AT_ORIGIN), "side of 50.0: give metres"),
         (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 0.1, (0.0, math.nan, 0.0)), "the origin of a map"),
         (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 0.1, (0.0, 0.0)), "the origin of a map"),
         (lambda: StaticLayer.of_cells(np.ones((2, 2), bool), 0.1, (0.0, 0.0, 90.0)), "yaw in rad, two turns at most"),

@@ -360,7 +360,7 @@ def test_draw_maps_writes_the_picture_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     draw(monkeypatch, tmp_path, "out=maps.png", "count=1", "map=static")
-    assert capsys.readouterr().out.strip() == "drew 1 maps: maps.png"
+    assert capsys.readouterr().out.strip() == "drew 1 map: maps.png"
     assert [path.name for path in tmp_path.iterdir()] == ["maps.png"]
     with Image.open(tmp_path / "maps.png") as image:
         assert min(image.size) > 300
@@ -379,7 +379,7 @@ def test_draw_maps_writes_maps_that_can_be_read_and_says_what_files_hold(
     assert re.match(
         r"drawn/train-0\.json: a square of 20\.0 m with \d+ boxes and \d+ cylinders; .* m², 100\.0 % ", told[0]
     )
-    assert told[1:] == ["drew 1 maps: again.png"]
+    assert told[1:] == ["drew 1 map: again.png"]
 
 
 @pytest.mark.parametrize(
