@@ -92,7 +92,7 @@ def largest_difference(device: str) -> float:
     here, there = make_learner(ROW, overrides), make_learner(ROW, overrides, device)
     batch = prepared(here)
     for learner in (here, there):
-        learner.loss._generator = torch_stream(0, "loss")  # drawn on the CPU and brought to the batch
+        learner.loss._generator = torch_stream(0, "loss")
     there.loss.load_state_dict(here.loss.state_dict())
     found = []
     for learner, place in ((here, "cpu"), (there, device)):
@@ -197,8 +197,12 @@ def graphed(learner: Any) -> Callable[[], Any]:
     """
     import torch
 
+    from rcdsac_trl.seeding import torch_stream
+
     for group in learner.optimizer.param_groups:
         group["capturable"] = True
+    # A graph replays what the device draws, and nothing that comes from the CPU.
+    learner.loss._generator = torch_stream(0, "graph", device=next(learner.loss.parameters()).device)
     static = prepared(learner).apply(held)
 
     def learn() -> None:

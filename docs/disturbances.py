@@ -1,7 +1,7 @@
 """Drive agents and planners while noise, delay, clutter or people disturb them, for the table of docs/off-the-maps.md.
 
 Each disturbance is one evaluation on the same maps, goals and movers; `--name`'s go into ``results/disturbances``.
-What a name has done already at that size, in ``build/disturbances``, is not driven again::
+What has been driven already, in ``build/disturbances``, is not driven again::
 
     python docs/disturbances.py --name rcdsac_cvar-narrow run=rcdsac_cvar-narrow beta=[0.25]
     python docs/disturbances.py --name mppi baseline=mppi
@@ -11,6 +11,7 @@ With ``--tell-latency`` an agent is told how late its commands act where they ar
 """
 
 import argparse
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -49,15 +50,15 @@ def main() -> None:
     parser.add_argument("--tell-latency", action="store_true", help="delayed commands: the agent knows it")
     parser.add_argument("overrides", nargs="+", help="whom evaluate drives: run=<agent> beta=[<one>], baseline=<name>")
     options = parser.parse_args()
-    done = ROOT / "build" / "disturbances" / f"{options.name}-{options.maps}x{options.episodes}"
+    done = ROOT / "build" / "disturbances"
     tables = []
-    for number, (disturbance, changes) in enumerate(DISTURBANCES.items()):
-        folder = done / str(number)
+    for disturbance, changes in DISTURBANCES.items():
+        if options.tell_latency and disturbance in LATENCY_S:
+            changes = (*changes, f"latency_s={LATENCY_S[disturbance]}")
+        asked = [*options.overrides, *changes, f"num_maps={options.maps}", f"num_episodes={options.episodes}"]
+        folder = done / f"{options.name}-{zlib.crc32(' '.join(asked).encode()):08x}"
         if not (folder / "episodes.csv").is_file():
-            if options.tell_latency and disturbance in LATENCY_S:
-                changes = (*changes, f"latency_s={LATENCY_S[disturbance]}")
-            sizes = f"num_maps={options.maps}", f"num_episodes={options.episodes}", f"out={folder}"
-            make_evaluation(compose("evaluate", [*options.overrides, *changes, *sizes])).run()
+            make_evaluation(compose("evaluate", [*asked, f"out={folder}"])).run()
         episodes = pd.read_csv(folder / "episodes.csv")[list(COLUMNS)]
         tables.append(episodes.assign(disturbance=disturbance))
     target = ROOT / "results" / "disturbances" / f"{options.name}.csv"

@@ -343,6 +343,10 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
             [RUN, "beta=[-2,-1]", "beta_controller=[clearance]", "controller.near_m=3.5", "controller.far_m=4"],
             "controller.near_m=3.5 is beyond the 3 m that agents see: lower it",
         ),
+        (
+            [RUN, "beta=[-2,-1]", "beta_controller=[tail_variance]", "navigation.watchdog=true"],
+            "beta_controller=[tail_variance] reads what critics expect of what is seen and of the action wanted",
+        ),
         ([RUN, "beta=[-2,-1]", "controller.window_steps=1"], "controller.window_steps=1 must be at least 2"),
         (["baseline=random"], "baseline=random is unknown: choose one of pursuit, dwa, mppi, or <module>:<class>"),
         (["baseline=3"], "baseline=3 must be text or null"),

@@ -229,6 +229,24 @@ def test_a_command_is_limited_from_where_the_robot_will_be() -> None:
         assert limited == {None, "the stop zone"}
 
 
+@pytest.mark.parametrize("mast_m", [0.205, 0.252])
+def test_a_mast_of_its_own_makes_no_wall_less_worth_keeping_clear_of(mast_m: float) -> None:
+    """A sector behind sees the robot itself, or something that touches it."""
+    guard, x, v = Guard(), 0.0, 0.0
+    mast = np.zeros(180, np.bool_)
+    mast[90] = True
+    while True:
+        wall = sector_distances(x, 0.0, 0.0, np.array([[1.5, -9.0, 1.5, 9.0]]), NO_CIRCLES)
+        command = guard.limit(0.6, 0.0, Sectors(np.where(mast, mast_m, wall), ALL), (v, 0.0))[:2]
+        before = x
+        for _ in range(7):
+            v, _ = clip_command(*command, v, 0.0)
+            x += 0.02 * v
+        if x == before:
+            break
+    assert 0.045 < 1.5 - x - guard.radius_m < 0.12
+
+
 def plain_limit(guard: Guard, v: float, sectors: Sectors, omega: float, moving: tuple[float, float]) -> float:
     """Return the linear velocity that the stop zone leaves: share by share, place by place, each sector's borders."""
     angles = np.arange(181) * math.pi / 90.0
@@ -237,13 +255,19 @@ def plain_limit(guard: Guard, v: float, sectors: Sectors, omega: float, moving: 
     for share in (1.0, 0.75, 0.5, 0.25):
         clearances = []
         for place in plain_way(share * v, omega, moving, guard.reaction_s):
-            gaps = [math.inf]
+            gaps = []
             for borders in (directions[:-1], directions[1:]):
                 along = np.maximum(borders @ place, sectors.distances_m)[seen]
-                gaps.extend(np.hypot(*(place - along[:, None] * borders[seen]).T))
-            clearances.append(min(gaps) - guard.radius_m)
-        needed = min(guard.margin_m, max(clearances[0] - 0.01, 0.01), clearances[0])
-        if min(clearances) >= needed:
+                gaps.extend(np.hypot(*(place - along[:, None] * borders[seen]).T) - guard.radius_m)
+            clearances.append(gaps)
+        rays = np.array(clearances)  # [places, rays]
+        close = rays[0] < 0.01
+        kept = [
+            group.min() >= min(guard.margin_m, max(group[0].min() - 0.01, 0.01), group[0].min())
+            for group in (rays[:, close], rays[:, ~close])
+            if group.size
+        ]
+        if all(kept):
             return share * v
     return 0.0
 

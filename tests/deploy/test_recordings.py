@@ -82,6 +82,15 @@ def test_without_odom_lines_velocities_are_differences_of_the_poses_behind_the_s
     assert velocities[2] == pytest.approx((0.0, (2 * math.pi - 6.2) / 0.25), abs=1e-9)
 
 
+def test_velocities_of_fast_scans_are_differences_over_20_ms_and_more(tmp_path: Path) -> None:
+    path = tmp_path / "some.log"
+    lines = [f"FLASER 2 1 1 0 0 0 {0.5 * at:.9f} 0 0 {10.0 + at:.9f} host 0\n" for at in np.arange(30) / 75.0]
+    path.write_text("".join(lines))
+    found = [messages.velocity_of_odometry(found.message)[0] for found in open_recording(path).messages(["/odom"])]
+    assert found[:2] == [0.0, 0.0]
+    assert found[2:] == pytest.approx([0.5] * 28, abs=1e-6)
+
+
 def test_a_robotlaser_says_its_own_angles_reach_and_velocities(tmp_path: Path) -> None:
     path = tmp_path / "some.log"
     path.write_text(

@@ -2,12 +2,13 @@
 
 import importlib.util
 import math
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from test_frames import tf
@@ -24,6 +25,7 @@ class Node:
     """What the node uses of ``rclpy.node.Node``; parameters that are set at the start, and a clock that stands."""
 
     given: dict[str, Any]
+    nodes: ClassVar[list["Node"]]
     endpoints: dict[str, list[str]]
 
     def __init__(self, name: str) -> None:
@@ -33,6 +35,8 @@ class Node:
         self.published: list[Any] = []
         self.publishers: dict[str, Any] = {}
         self.timers: list[Any] = []
+        self.waited: list[Any] = []
+        self.nodes.append(self)
         self.told: list[str] = []
 
     def declare_parameter(self, name: str, default: Any) -> Any:
@@ -51,7 +55,7 @@ class Node:
 
     def create_publisher(self, kind: Any, topic: str, qos: Any) -> Any:
         self.publishers[topic] = kind
-        return SimpleNamespace(publish=self.published.append)
+        return SimpleNamespace(publish=self.published.append, wait_for_all_acked=self.waited.append)
 
     def create_timer(self, period_s: float, callback: Any) -> None:
         self.timers.append(callback)
@@ -91,10 +95,17 @@ def ros_node(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
     """Import the node with stand-ins for ROS's packages; it drives an agent that is written for it."""
     for name, content in packed(agent()).items():
         (tmp_path / name).write_bytes(content)
-    Node.given, Node.endpoints = {"agent": str(tmp_path)}, {}
+    Node.given, Node.endpoints, Node.nodes = {"agent": str(tmp_path)}, {}, []
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)  # the test's own stay
     contents: dict[str, dict[str, Any]] = {
-        "rclpy": {"init": lambda: None, "try_shutdown": lambda: None, "spin": lambda node: node.timers[0]()},
+        "rclpy": {
+            "init": lambda signal_handler_options: None,
+            "try_shutdown": lambda: None,
+            "spin": lambda node: node.timers[0](),
+        },
+        "rclpy.duration": {"Duration": lambda seconds: seconds},
         "rclpy.node": {"Node": Node},
+        "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO="none")},
         "rclpy.parameter": {"Parameter": SimpleNamespace},
         "rclpy.qos": {
             "qos_profile_sensor_data": 5,
@@ -277,6 +288,22 @@ def test_the_program_spins_and_leaves_ros(ros_node: Any, monkeypatch: pytest.Mon
     monkeypatch.setattr(ros_node.rclpy, "try_shutdown", lambda: done.append("left"))
     ros_node.main()
     assert done == ["there is no odometry yet; it stands until good input comes", "left"]
+
+
+@pytest.mark.parametrize("kind", ["TwistStamped", "Twist"])
+def test_the_last_command_is_to_stand(ros_node: Any, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    Node.given["command_type"] = kind
+
+    def spin(node: Any) -> None:
+        assert driven(node).twist.linear.x != 0.0 if kind == "TwistStamped" else driven(node).linear.x != 0.0
+        raise KeyboardInterrupt  # Ctrl-C, and SIGTERM
+
+    monkeypatch.setattr(ros_node.rclpy, "spin", spin)
+    ros_node.main()
+    (node,) = Node.nodes
+    last = node.published[-1].twist if kind == "TwistStamped" else node.published[-1]
+    assert (last.linear.x, last.angular.z) == (0.0, 0.0)
+    assert node.waited == [1.0]
 
 
 def test_without_ros_it_says_what_to_source(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from rcdsac_trl.rollout.planners.trajectory_costs import (
     TrajectoryCosts,
     next_velocities,
 )
+from rcdsac_trl.world.sim.lidar import sector_distances
 from rcdsac_trl.world.task.episode import draw_motor_steps
 from rcdsac_trl.world.task.rules import TaskSettings
 from scenes import Scene
@@ -185,6 +186,16 @@ def test_a_disc_that_walks_is_tracked_with_its_velocity() -> None:
 
 def test_what_stands_does_not_move() -> None:
     assert len(tracked((0.0, 0.0), steps=30).moving) == 0
+
+
+def test_what_stands_behind_a_robot_that_sees_all_around_and_turns_does_not_move() -> None:
+    full = sensor_mask("full")
+    tracks = MoverTracks(TrackSettings(), full)
+    pillar = np.array([(-1.3, 0.0, 0.3)])
+    for step in range(100):
+        pose = np.array([0.0, 0.0, 0.4 * math.sin(0.6 * PERIOD_S * step)])
+        tracks.observe(sector_distances(*pose, np.empty((0, 4)), pillar), pose, PERIOD_S, full)
+        assert len(tracks.moving) == 0
 
 
 def test_a_sparse_sensor_tracks_nothing() -> None:

@@ -10,6 +10,7 @@ from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.risk import PowerLaw
 from rcdsac_trl.agent.transforms import Relabel
 from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
+from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.training.make_learner import make_replay
 from tiny import tiny_settings
 
@@ -38,6 +39,13 @@ def meta_loss(row: str) -> DistributionalSACLoss:
     loss.log_alpha = nn.Parameter(loss.log_alpha.detach().to("meta"))
     loss.make_value_estimator(gamma=0.99)
     return loss
+
+
+def test_random_numbers_come_from_the_cpu_wherever_networks_are() -> None:
+    """Else a run of a GPU could neither go on nor be evaluated where there is none."""
+    settings = tiny_settings("rcdsac_pow")
+    there, here = (make_loss(settings, device) for device in ("meta", "cpu"))
+    assert torch.equal(there.rng_state, here.rng_state)
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")  # TorchRL's does not get through meta parameters

@@ -222,6 +222,7 @@ def test_range_noise_has_the_given_spread():
 
 
 def test_range_dropout_loses_the_given_share():
+    assert noisy_ranges(np.full(1000, 0.1), 0.2, 0.0, stream(0, "test_task")).min() == 0.0  # nothing is behind itself
     noisy = noisy_ranges(np.ones(100_000), 0.0, 0.2, stream(0, "test_task"))
     assert np.isinf(noisy).mean() == pytest.approx(0.2, abs=0.005)
     assert (noisy[np.isfinite(noisy)] == 1.0).all()

@@ -104,7 +104,7 @@ class Relabel:
         mode: ``"resample"`` draws a fresh beta; ``"stored"`` keeps the one in the batch; ``"fixed"`` sets `beta`.
         per: draw once for each ``"transition"`` or each ``"sequence"`` (resample only).
         beta: the value of ``"fixed"``.
-        generator: source of the draws, on the batch's device (resample only).
+        generator: source of the draws, which are brought to the batch's device (resample only).
 
     Example:
         >>> from tensordict import TensorDict
@@ -141,7 +141,7 @@ class Relabel:
             return batch.set("risk", one.expand(sequences, slots, 1))
         if self.mode == "resample" and self.generator is not None:
             drawn = self.measure.sample((sequences, slots if self.per == "transition" else 1, 1), self.generator)
-            return batch.set("risk", drawn.expand(sequences, slots, 1))
+            return batch.set("risk", drawn.to(batch.device or drawn.device).expand(sequences, slots, 1))
         return batch
 
 

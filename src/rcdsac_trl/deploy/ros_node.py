@@ -7,8 +7,10 @@ on ``return_quantiles``, and on ``drive_status`` why the robot does not go as th
 be set while it runs; every parameter is explained in docs/nav2.md.
 """
 
+import contextlib
 import importlib
 import math
+import signal
 import sys
 from functools import partial
 from typing import Any
@@ -31,15 +33,18 @@ except ModuleNotFoundError as error:
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import LaserScan, PointCloud2
 from std_msgs.msg import Float32MultiArray, String
 from tf2_msgs.msg import TFMessage
 
 import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
+from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
 from rcdsac_trl.deploy.ros.topics import DRIVING, no_map_on, readers_of, without_numbers, writers_of
@@ -56,6 +61,7 @@ _KEPT_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _TF_QOS = QoSProfile(depth=100)
 _STATIC_TF_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _REPORT_PERIOD_S = 2.0
+_LAST_S = 1.0  # so long it waits until its last command has come
 
 
 class PolicyNode(Node):
@@ -149,11 +155,22 @@ class PolicyNode(Node):
                 (self.driver.policy.stop if parameter.value else self.driver.policy.resume)()
         return SetParametersResult(successful=True)
 
-    def _drive(self) -> None:
-        now_s = self.get_clock().now().nanoseconds * 1e-9
-        command = self.driver.command(now_s)
+    def leave(self) -> None:
+        """Send a last command, to stand, and wait until it has come."""
+        self._write(self.driver.policy.refuse("the node leaves"), self._now_s())
+        self._commands.wait_for_all_acked(Duration(seconds=_LAST_S))
+
+    def _now_s(self) -> float:
+        return float(self.get_clock().now().nanoseconds) * 1e-9
+
+    def _write(self, command: Command, now_s: float) -> None:
         stamped = self._command_type == "TwistStamped"
         self._commands.publish(twist_stamped(command, now_s, _made) if stamped else twist(command, _made))
+
+    def _drive(self) -> None:
+        now_s = self._now_s()
+        command = self.driver.command(now_s)
+        self._write(command, now_s)
         if command.quantiles is not None:
             self._quantiles.publish(Float32MultiArray(data=command.quantiles.tolist()))
         self._status.publish(String(data=command.reason or DRIVING))
@@ -188,8 +205,10 @@ def _made(name: str) -> Any:
 
 
 def main() -> None:
-    """Spin until Ctrl-C."""
-    rclpy.init()
+    """Spin until Ctrl-C or SIGTERM, and leave the robot standing."""
+    # Handlers of its own would shut ROS down at once, and no last command could be sent.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         node = PolicyNode()
     except UserInputError as error:
@@ -197,7 +216,9 @@ def main() -> None:
         print(error, file=sys.stderr)
         raise SystemExit(2) from None
     try:
-        rclpy.spin(node)
+        with contextlib.suppress(KeyboardInterrupt):
+            rclpy.spin(node)
+        node.leave()
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -33,9 +33,11 @@ class CompiledGuard(Guard):
         borders, nearest = self._within_reach(sectors, abs(v), begin)
         if not len(nearest):
             return 1.0
+        state = begin.pose, begin.velocities
+        if self._is_close(np.array(begin.pose[:2]), np.empty(0), borders, nearest).any():
+            return super()._fastest(v, omega, sectors, begin, been)
         changes = self.robot.max_acceleration_m_per_s2 * STEP_S, self.robot.max_angular_acceleration * STEP_S
         kept = self.radius_m, self.margin_m
-        state = begin.pose, begin.velocities
         share = _fastest_of_disc((v, omega), state, self._reacting, changes, kept, borders, nearest, _DEFINED)
         return float(share)
 

@@ -19,7 +19,13 @@ from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors, check_switches
-from rcdsac_trl.robot.sensed_distances import outline_distances, place_distances, sensed_within
+from rcdsac_trl.robot.sensed_distances import (
+    outline_distances,
+    outline_ray_distances,
+    place_distances,
+    ray_distances,
+    sensed_within,
+)
 from rcdsac_trl.robot.stopping_path import STEP_S, stopping_paths
 
 # Shares of the wanted speed that are tried, the fastest first.
@@ -239,10 +245,42 @@ class Guard:
             return omega
         for share in SHARES:
             places, headings = self._ways([0.0], share * omega, begin)
-            clearance = self._clearances(places, headings, borders, nearest)[0]
-            if clearance.min() >= self._needed_m(float(clearance[0])):
+            if self._kept(places, headings, borders, nearest)[0]:
                 return share * omega
         return 0.0
+
+    def _kept(
+        self,
+        places: NDArray[np.float64],
+        headings: NDArray[np.float64],
+        borders: NDArray[np.float64],
+        nearest: NDArray[np.float64],
+    ) -> NDArray[np.bool_]:
+        """Return which ways keep their distance from what is sensed, bool [shares]; see :meth:`_clearances`.
+
+        From what is nearer than the least already, such as a mast of the robot's own, it must come no nearer. That
+        makes nothing else less worth keeping clear of.
+        """
+        kept = np.ones(len(places), np.bool_)
+        close = self._is_close(places[0, 0], headings[0], borders, nearest)
+        for rays in (close, ~close) if close.any() else (slice(None),):
+            if len(nearest[rays]):
+                clearance = self._clearances(places, headings, borders[:, rays], nearest[rays])
+                kept &= clearance.min(axis=1) >= self._needed_m(float(clearance[0, 0]))
+        return kept
+
+    def _is_close(
+        self,
+        place: NDArray[np.float64],
+        heading: NDArray[np.float64],
+        borders: NDArray[np.float64],
+        nearest: NDArray[np.float64],
+    ) -> NDArray[np.bool_]:
+        """Return in which directions what is sensed is nearer to the robot at a place than the least, bool [m]."""
+        if self._is_a_disc:
+            return ray_distances(place, borders, nearest) - self.radius_m < LEAST_M
+        outline = self.robot.outline
+        return outline_ray_distances(outline, place[None, None], heading[None], borders, nearest)[0, 0] < LEAST_M
 
     def _needed_m(self, now_m: float) -> float:
         """Return the clearance that must stay, m, of who has `now_m` of it."""
@@ -267,8 +305,7 @@ class Guard:
         places, headings = self._ways(speeds, omega, begin)
         allowed = np.ones(len(SHARES), np.bool_)
         if len(nearest):
-            clearance = self._clearances(places, headings, borders, nearest)
-            allowed = clearance.min(axis=1) >= self._needed_m(float(clearance[0, 0]))
+            allowed = self._kept(places, headings, borders, nearest)
         if been is not None:
             allowed &= self._has_been(places, been)
         return next((share for share, free in zip(SHARES, allowed.tolist(), strict=True) if free), 0.0)

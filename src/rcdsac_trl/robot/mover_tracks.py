@@ -138,11 +138,15 @@ def _find(
 
     Seen whole is what has sectors on both sides that see farther: else its edge is another thing's, or the view's.
     """
-    # Begin where no thing goes on from the sector before; a full ring of sectors is cut open behind the robot.
+    # Begin where no thing goes on from the sector before: at one without a sensor, or else where ranges jump.
     start = NUM_BINS // 2
     for _ in range(NUM_BINS):
         if sensed[start]:
             start = (start + 1) % NUM_BINS
+    if sensed[start]:
+        for _ in range(NUM_BINS):
+            if abs(ranges_m[start] - ranges_m[start - 1]) <= step_m:
+                start = (start + 1) % NUM_BINS
     number = done = 0
     while done < NUM_BINS:
         first = (start + done) % NUM_BINS

@@ -39,14 +39,35 @@ def place_distances(
         >>> place_distances(np.array([[0.0, 0.0], [3.0, 0.5]]), ahead, np.array([2.0]))  # the second one lies behind it
         array([2. , 0.5])
     """
+    squared = _squared_less_place(places, borders, nearest).min(axis=-1) + np.square(places).sum(axis=-1)
+    return np.sqrt(np.maximum(squared, 0.0))
+
+
+def ray_distances(
+    places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how far each place is from what is sensed in each direction, m, [..., m]; see :func:`place_distances`.
+
+    Example:
+        >>> ahead_and_left = np.array([[1.0, 0.0], [0.0, 1.0]])
+        >>> ray_distances(np.zeros(2), ahead_and_left, np.array([2.0, 1.0]))
+        array([2., 1.])
+    """
+    squared = _squared_less_place(places, borders, nearest) + np.square(places).sum(axis=-1)[..., None]
+    return np.sqrt(np.maximum(squared, 0.0))
+
+
+def _squared_less_place(
+    places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return squared distances less the squared distance of the place from here, [..., m], m^2."""
     along = places @ borders
     point = np.maximum(along, nearest)
     # |place - point u|^2 = |place|^2 + point (point - 2 place u) for a direction u, in few passes over large arrays.
     along *= 2.0
     np.subtract(point, along, out=along)
     along *= point
-    squared = along.min(axis=-1) + np.square(places).sum(axis=-1)
-    return np.sqrt(np.maximum(squared, 0.0))
+    return along
 
 
 def outline_distances(
@@ -74,15 +95,26 @@ def outline_distances(
         >>> outline_distances(square, places, headings, np.array([[1.0], [0.0]]), np.array([2.0])).round(3)
         array([[1.5  , 1.293]])
     """
+    return outline_ray_distances(outline, places, headings, borders, nearest).min(axis=-1)
+
+
+def outline_ray_distances(
+    outline: NDArray[np.float64],
+    places: NDArray[np.float64],
+    headings: NDArray[np.float64],
+    borders: NDArray[np.float64],
+    nearest: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the same of what is sensed in each direction, m, [k, n, m]; see :func:`outline_distances`."""
     cos, sin = headings[:, 0], headings[:, 1]
     turns = np.stack((np.stack((cos, sin), axis=-1), np.stack((-sin, cos), axis=-1)), axis=1)  # [n, frame, map]
     corners = places[:, :, None] + outline @ turns
-    at_corners = place_distances(corners, borders, nearest).min(axis=-1)
+    at_corners = ray_distances(corners, borders, nearest).min(axis=2)
     # The rays in the body's frame, [k, n, m, 2].
     begin = np.einsum("nij,snmj->snmi", turns, (borders * nearest).T - places[:, :, None])
     along = np.broadcast_to(np.einsum("nij,jm->nmi", turns, borders), begin.shape)
     at_begin, met = _point_and_ray(outline, begin, along)
-    return np.where(met.any(axis=-1), 0.0, np.minimum(at_corners, at_begin.min(axis=-1)))
+    return np.where(met, 0.0, np.minimum(at_corners, at_begin))
 
 
 def _point_and_ray(

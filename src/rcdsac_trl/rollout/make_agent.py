@@ -40,7 +40,7 @@ def make_loss(settings: TrainingSettings, device: str) -> LossModule:
         [critic.to(device) for critic in critics],
         learner,
         measure=algo.distortion.measure,
-        generator=torch_stream(settings.seed, "loss", device=device),
+        generator=torch_stream(settings.seed, "loss"),  # on the CPU: so a run goes on, and is evaluated, anywhere
         threads=settings.update_threads,
     ).to(device)
     loss.make_value_estimator(gamma=learner.gamma)
@@ -102,7 +102,7 @@ def parameters(params: TensorDictParams) -> list[torch.nn.Parameter]:
     return [p for p in params.values(True, True) if isinstance(p, torch.nn.Parameter)]
 
 
-def make_relabel(settings: TrainingSettings, device: str) -> Relabel | None:
+def make_relabel(settings: TrainingSettings) -> Relabel | None:
     """Make what sets the beta of a batch; None where losses read no beta."""
     algo = settings.algo
     if algo.critic == "scalar":
@@ -115,5 +115,5 @@ def make_relabel(settings: TrainingSettings, device: str) -> Relabel | None:
         mode="fixed" if fixed is not None else algo.relabel,
         per=settings.learner.resample_per,
         beta=fixed,
-        generator=torch_stream(settings.seed, "relabel", device=device),
+        generator=torch_stream(settings.seed, "relabel"),
     )

@@ -19,7 +19,7 @@ def make_learner(settings: TrainingSettings, device: str, inherited_steps: int =
         replay=make_replay(settings, device, inherited_steps),
         mirror=Mirror(sensed, device) if settings.learner.mirror else None,
         loss=loss,
-        relabel=make_relabel(settings, device),
+        relabel=make_relabel(settings),
         optimizer=make_optimizer(loss, settings.learner),
         targets=FusedSoftUpdate(loss, tau=settings.learner.target_coefficient),
         clipped=[parameters(loss.actor_network_params), parameters(loss.critic_network_params)],

@@ -59,6 +59,7 @@ class CarmenLog:
             UserInputError: naming a line that cannot be read.
         """
         last: tuple[float, tuple[float, float, float]] | None = None
+        moving = 0.0, 0.0
         for number, words in self._lines():
             try:
                 if words[0] == "ODOM" and ODOM_TOPIC in topics:
@@ -70,9 +71,10 @@ class CarmenLog:
                         _flaser(words, self._range_max_m) if is_flaser else _robotlaser(words)
                     )
                     if not self._has_odometry and ODOM_TOPIC in topics:
-                        velocity = velocity or _difference(last, stamp_s, pose)
-                        yield RecordedMessage(stamp_s, ODOM_TOPIC, _odometry(stamp_s, pose, velocity))
-                        last = stamp_s, pose
+                        if last is None or not 0.0 <= stamp_s - last[0] < _SHORTEST_S:
+                            moving = (0.0, 0.0) if last is None else _difference(last, stamp_s, pose)
+                            last = stamp_s, pose
+                        yield RecordedMessage(stamp_s, ODOM_TOPIC, _odometry(stamp_s, pose, velocity or moving))
                     if SCAN_TOPIC in topics:
                         yield RecordedMessage(stamp_s, SCAN_TOPIC, scan)
             except (ValueError, IndexError, OverflowError) as error:
@@ -181,10 +183,10 @@ def _header(stamp_s: float, frame: str) -> Any:
 
 
 def _difference(
-    last: tuple[float, tuple[float, float, float]] | None, stamp_s: float, pose: tuple[float, float, float]
+    last: tuple[float, tuple[float, float, float]], stamp_s: float, pose: tuple[float, float, float]
 ) -> tuple[float, float]:
-    """Return the velocities between two poses: along the heading of the first, and of the turn."""
-    if last is None or stamp_s - last[0] < _SHORTEST_S:
+    """Return the velocities between two poses: along the heading of the first, and of the turn; 0 back in time."""
+    if stamp_s <= last[0]:
         return 0.0, 0.0
     (x, y, yaw), took_s = last[1], stamp_s - last[0]
     ahead_m = (pose[0] - x) * math.cos(yaw) + (pose[1] - y) * math.sin(yaw)

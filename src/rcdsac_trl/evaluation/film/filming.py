@@ -70,7 +70,9 @@ def recorded(
     """Drive a map, and return the moments of one episode under every condition."""
     rows = [block * spec.num_episodes + episode for block in range(len(spec.conditions))]
     predictor = None
-    if agent is not None and spec.trained.algo.critic == "quantile":
+    # With navigation around it an agent is told, and driven, otherwise than the environment says.
+    alone = not any(vars(spec.navigation).values())
+    if agent is not None and alone and spec.trained.algo.critic == "quantile":
         predictor = QuantilePredictor(unpacked_loss(spec.trained, agent.loss).critics, rows)
     watching: list[Recorder] = []
 

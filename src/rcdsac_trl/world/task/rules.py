@@ -237,7 +237,8 @@ def noisy_ranges(
         rng: the noise's own stream.
     """
     if noise_std_m > 0.0:
-        distances = distances + noise_std_m * rng.standard_normal(distances.shape)
+        # No sensor says less than nothing; what is inside of its body a robot would leave out.
+        distances = np.maximum(distances + noise_std_m * rng.standard_normal(distances.shape), 0.0)
     if dropout > 0.0:
         distances = np.where(rng.random(distances.shape) < dropout, np.inf, distances)
     return distances
