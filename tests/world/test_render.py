@@ -8,6 +8,7 @@ import pytest
 from rcdsac_trl.colors import CAPTIONS, LIGHT, rgb
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.range_sensor import sensor_mask
+from rcdsac_trl.world import render
 from rcdsac_trl.world.canvas import scale_bar_m
 from rcdsac_trl.world.legend import legend
 from rcdsac_trl.world.maps.generator import MapSettings
@@ -152,6 +153,16 @@ def test_a_legend_fits_its_picture() -> None:
 def test_every_thing_has_a_key_of_its_own() -> None:
     names = ("robot", "seen", "hit", "remembered", "expected", "contact", "trail", "way", "goal", "wall")
     assert len({np.asarray(legend({name: ""}, 64, 24.0)).tobytes() for name in names}) == len(names)
+
+
+def test_a_map_too_large_to_be_kept_as_a_picture_is_drawn_alike_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = Renderer(200, view_m=6.0).draw(scene()).astype(int)
+    monkeypatch.setattr(render, "_LARGEST_BACKGROUND_PX", 100)
+    renderer = Renderer(200, view_m=6.0)
+    drawn = renderer.draw(scene()).astype(int)
+    assert np.abs(drawn - kept).max() <= 32  # a line's edge may fall on the next fine pixel
+    assert (drawn == kept).mean() > 0.99
+    assert renderer._background is None
 
 
 @pytest.mark.parametrize("wrong", [{"size_px": 4}, {"view_m": 0.0}, {"oversampling": 0}])

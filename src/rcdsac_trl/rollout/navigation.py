@@ -80,6 +80,8 @@ class NavigatedPolicy(Timed, TensorDictModuleBase):
         action = asked["action"].clone()
         for row, each in enumerate(advice):
             driven = each.instead
+            if driven is not None:  # as far as an action can say it: slow turns are none, and the guard is to know
+                driven = desired_velocities(action_of(*driven, self._robot), self._robot)
             if self._guard is not None:
                 wish = desired_velocities(action[row].tolist(), self._robot) if driven is None else driven
                 seen = Sectors(distances_m[row], self._sensed, self._robot.lidar.max_range_m)

@@ -22,6 +22,8 @@ SEEN_OPACITY = 0.2
 """Of what the sensor sees: the floor and what stands there show through."""
 GOAL_OPACITY = 0.24
 """Of the inside of a goal's ring."""
+# The whole of a map is kept up to this side; of a larger one each frame draws what it shows.
+_LARGEST_BACKGROUND_PX = 8192
 # Around a map that is shown as a whole, as a share of its side.
 _MARGIN = 0.02
 
@@ -158,20 +160,27 @@ class Renderer:
         view = self.shown_m(map_)
         side = self._size_px * self._fine
         scale = side / view
-        if self._background is None or self._background[0] is not map_:
-            full = round(whole * scale)
-            background = Image.new("RGB", (full, full), LIGHT.outside)
-            _draw_map(Canvas(background, scale, -margin, map_.size_m + margin), map_)
-            self._background = (map_, background)
-        background = self._background[1]
+        full = round(whole * scale)
         if self._view_m is None:
-            return Canvas(background.copy(), scale, -margin, map_.size_m + margin)
+            return Canvas(self._drawn(map_, full, scale, margin).copy(), scale, -margin, map_.size_m + margin)
         # Snap the window to whole pixels of the background, and the frame's origin with it.
         column = round((centre[0] + margin) * scale - side / 2)
         line = round((map_.size_m + margin - centre[1]) * scale - side / 2)
         window = Image.new("RGB", (side, side), LIGHT.outside)
-        window.paste(background, (-column, -line))
-        return Canvas(window, scale, column / scale - margin, map_.size_m + margin - line / scale)
+        canvas = Canvas(window, scale, column / scale - margin, map_.size_m + margin - line / scale)
+        if full > _LARGEST_BACKGROUND_PX:
+            _draw_map(canvas, map_)
+        else:
+            window.paste(self._drawn(map_, full, scale, margin), (-column, -line))
+        return canvas
+
+    def _drawn(self, map_: Map, full: int, scale: float, margin: float) -> Image.Image:
+        """Return the picture of a whole map, which is drawn once."""
+        if self._background is None or self._background[0] is not map_:
+            background = Image.new("RGB", (full, full), LIGHT.outside)
+            _draw_map(Canvas(background, scale, -margin, map_.size_m + margin), map_)
+            self._background = (map_, background)
+        return self._background[1]
 
     def _write(self, image: Image.Image, caption: str) -> None:
         pad = 6 * self._fine
