@@ -1,7 +1,6 @@
 """Speed limit and stop zone: closed forms on plain scenes, and no collision in any scene, whatever is commanded."""
 
 import math
-from collections import deque
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from motors import driven
+from motors import LateMotors, driven
 
 from rcdsac_trl.deploy import Guard, PathFollower, Sectors
 from rcdsac_trl.errors import UserInputError
@@ -190,12 +189,11 @@ def test_no_command_that_acts_late_drives_into_what_is_sensed(seed: int, latency
     rng = np.random.default_rng(seed)
     segments = rng.uniform(-3, 3, (6, 4))
     circles = np.column_stack([rng.uniform(-3, 3, (10, 2)), rng.uniform(0.02, 0.3, 10)])
-    guard, latency = Guard(), Latency(latency_s)
+    guard, latency, motors = Guard(), Latency(latency_s), LateMotors(latency_s)
     if free_distance(0.0, 0.0, segments, circles) < guard.radius_m + guard.margin_m:
         return
     x = y = yaw = v = omega = 0.0
     wanted = (0.0, 0.0)
-    under_way = deque([wanted] * round(latency_s / 0.02))
     for step in range(120):
         if step % 5 == 0:
             wanted = float(rng.choice([0.6, 0.6, -0.2, rng.uniform(-0.2, 0.6)])), float(rng.uniform(-1.57, 1.57))
@@ -203,12 +201,9 @@ def test_no_command_that_acts_late_drives_into_what_is_sensed(seed: int, latency
         ahead = latency.ahead((v, omega), 0.14 * step)
         command = guard.limit(*wanted, seen, (v, omega), None, ahead)[:2]
         latency.note(command, 0.14 * step)
-        for _ in range(7):
-            under_way.append(command)
-            v, omega = clip_command(*under_way.popleft(), v, omega)
-            yaw += omega * 0.02
-            x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
-            assert free_distance(x, y, segments, circles) > guard.radius_m
+        poses, (v, omega) = motors.driven(command, (x, y, yaw), (v, omega))
+        x, y, yaw = poses[-1]
+        assert min(free_distance(*pose[:2], segments, circles) for pose in poses) > guard.radius_m
 
 
 def test_a_command_is_limited_from_where_the_robot_will_be() -> None:
@@ -239,9 +234,8 @@ def test_a_mast_of_its_own_makes_no_wall_less_worth_keeping_clear_of(mast_m: flo
         wall = sector_distances(x, 0.0, 0.0, np.array([[1.5, -9.0, 1.5, 9.0]]), NO_CIRCLES)
         command = guard.limit(0.6, 0.0, Sectors(np.where(mast, mast_m, wall), ALL), (v, 0.0))[:2]
         before = x
-        for _ in range(7):
-            v, _ = clip_command(*command, v, 0.0)
-            x += 0.02 * v
+        poses, (v, _) = driven(command, (x, 0.0, 0.0), (v, 0.0))
+        x = poses[-1][0]
         if x == before:
             break
     assert 0.045 < 1.5 - x - guard.radius_m < 0.12

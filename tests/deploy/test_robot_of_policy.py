@@ -220,7 +220,7 @@ def test_distances_of_an_outline_are_those_of_all_its_points() -> None:
         nearest = rng.uniform(0.05, 1.0, 3)
         place, yaw = rng.uniform(-0.4, 0.4, 2), rng.uniform(-math.pi, math.pi)
         cos, sin = math.cos(yaw), math.sin(yaw)
-        found = outline_distances(corners, place[None, None], np.array([[cos, sin]]), borders, nearest)[0, 0]
+        found = outline_distances(corners, place[None, None], np.array([[cos, sin]]), borders, nearest)[0, 0].min()
         turned = corners @ np.array([[cos, sin], [-sin, cos]]) + place
         outline = np.concatenate(
             [a + sides * (b - a) for a, b in zip(turned, np.roll(turned, -1, axis=0), strict=True)]

@@ -3,13 +3,13 @@
 import copy
 import math
 from array import array
-from collections import deque
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from motors import LateMotors
 from test_frames import tf
 from test_navigator import ALL, AT_ONCE, in_robot, seen
 from test_robot_driver import header, laser, odometry, path
@@ -24,7 +24,6 @@ from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.deploy.policy.input_checks import Stamps
 from rcdsac_trl.deploy.ros.messages import static_layer_of
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.latency import Latency
 from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.robot.sectors import Mount, Sectors
@@ -135,18 +134,15 @@ def test_a_fast_robot_stands_before_a_pane_that_only_the_map_shows(latency_s: fl
     """At 2 m/s its stop zone looks 2 m and farther."""
     robot = replace(PAPER, max_speed_m_per_s=2.0)
     navigator = Navigator(AT_ONCE, robot, StaticLayer.of_shapes(np.array([[6.0, -5.0, 6.0, 5.0]])))
-    guard, latency = Guard.of(robot), Latency(latency_s, robot)
+    guard, latency, motors = Guard.of(robot), Latency(latency_s, robot), LateMotors(latency_s, robot)
     x = v = 0.0
-    under_way = deque([(0.0, 0.0)] * round(latency_s / 0.02))
     for step in range(50):
         ahead = latency.ahead((v, 0.0), 0.14 * step)
         known = navigator.known(Sectors(OPEN, ALL), (x, 0.0, 0.0), guard.reach_m(2.0, ahead))
         command = guard.limit(2.0, 0.0, known, (v, 0.0), None, ahead)[0], 0.0
         latency.note(command, 0.14 * step)
-        for _ in range(7):
-            under_way.append(command)
-            v, _ = clip_command(*under_way.popleft(), v, 0.0, 0.02, robot)
-            x += 0.02 * v
+        poses, (v, _) = motors.driven(command, (x, 0.0, 0.0), (v, 0.0))
+        x = poses[-1][0]
     assert v == 0.0
     assert 0.04 < 6.0 - x - guard.radius_m < 0.12
 

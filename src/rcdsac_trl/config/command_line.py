@@ -63,6 +63,17 @@ def _within(found: re.Match[str], text: str) -> str:
     return text if is_quoted else re.sub(r"([^\w/.+%@-])", r"\\\1", text)
 
 
+def as_text(value: str) -> str:
+    r"""Put a text in quotes as Hydra reads them: only quotes are escaped, and backslashes before one.
+
+    Example:
+        >>> print(as_text(r'C:\maps "new"'))
+        "C:\maps \"new\""
+    """
+    escaped = re.sub(r'(\\*)"', r"\1\1\"", value)
+    return '"' + re.sub(r"(\\+)$", r"\1\1", escaped) + '"'
+
+
 def quoted(key: str, value: str) -> str:
     r"""Write an override so that a shell and Hydra leave its value as it is.
 
@@ -70,8 +81,8 @@ def quoted(key: str, value: str) -> str:
         >>> print(quoted("out", "a,b"))
         'out="a,b"'
     """
-    escaped = value.strip("'\"").replace('"', '\\"')
-    return shlex.quote(f'{key}="{escaped}"')
+    text = as_text(value.strip("'\""))
+    return shlex.quote(f"{key}={text}")
 
 
 def assigned(key: str, value: str) -> str:
@@ -93,8 +104,7 @@ def listed(key: str, value: str) -> str:
     """
     if re.fullmatch(_PLAIN, value):
         return f"{key}=[{value}]"
-    escaped = value.replace('"', '\\"')
-    return shlex.quote(f'{key}=["{escaped}"]')
+    return shlex.quote(f"{key}=[{as_text(value)}]")
 
 
 def with_names(key: str, words: Sequence[str]) -> list[str]:

@@ -117,7 +117,7 @@ class EvaluationSettings:
                 f"{what} what critics expect of what is seen now, and with latency_s agents are told what will be: "
                 "leave one out"
             )
-        if "tail_variance" in asked and any(vars(self.navigation).values()):
+        if "tail_variance" in asked and self.navigation.is_on:
             raise UserInputError(
                 "beta_controller=[tail_variance] reads what critics expect of what is seen and of the action wanted, "
                 "and with navigation.* agents are told, and driven, otherwise: leave one out"

@@ -1,12 +1,11 @@
 """What ``train init=<agent>`` chooses unless a user says otherwise: an agent goes on as what it is."""
 
 import json
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from rcdsac_trl.config.command_line import key_of
+from rcdsac_trl.config.command_line import as_text, key_of
 from rcdsac_trl.config.named_folder import find_agent
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings
@@ -72,10 +71,7 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _written(value: Any) -> str:
-    """Write a value as Hydra reads it: JSON, but texts, in which only quotes and what is before them are escaped."""
+    """Write a value as Hydra reads it: as JSON, but for texts."""
     if isinstance(value, list | tuple):
         return f"[{','.join(_written(each) for each in value)}]"
-    if not isinstance(value, str):
-        return json.dumps(value)
-    before_quotes = re.sub(r'(\\*)"', r"\1\1\"", value)
-    return '"' + re.sub(r"(\\+)$", r"\1\1", before_quotes) + '"'
+    return as_text(value) if isinstance(value, str) else json.dumps(value)

@@ -26,6 +26,11 @@ class EvaluationNavigationSettings(NavigationSettings):
 
     stop_zone: bool = False
 
+    @property
+    def is_on(self) -> bool:
+        """Whether anything stands between the agent, or planner, and the wheels."""
+        return self.replan or self.watchdog or self.stop_zone
+
 
 @dataclass(frozen=True)
 class CourseNavigationSettings(NavigationSettings):

@@ -34,8 +34,6 @@ class CompiledGuard(Guard):
         if not len(nearest):
             return 1.0
         state = begin.pose, begin.velocities
-        if self._is_close(np.array(begin.pose[:2]), np.empty(0), borders, nearest).any():
-            return super()._fastest(v, omega, sectors, begin, been)
         changes = self.robot.max_acceleration_m_per_s2 * STEP_S, self.robot.max_angular_acceleration * STEP_S
         kept = self.radius_m, self.margin_m
         share = _fastest_of_disc((v, omega), state, self._reacting, changes, kept, borders, nearest, _DEFINED)
@@ -56,8 +54,12 @@ def _fastest_of_disc(
     """Return the largest share of the wanted speed whose way keeps its distance, 0 if none does."""
     (radius_m, margin_m), (shares, step_s, blur_m, least_m, stands) = kept, defined
     pose, moving = state
-    now_m = _gap(pose[0], pose[1], borders, nearest) - radius_m
-    needed_m = min(margin_m, max(now_m - blur_m, least_m), now_m)
+    close = np.zeros(len(nearest), np.bool_)
+    for row in range(len(nearest)):
+        close[row] = _gap(pose[0], pose[1], _less_place(pose[0], pose[1], borders, nearest, row)) - radius_m < least_m
+    far_m, close_m = _gaps(pose[0], pose[1], borders, nearest, close)
+    far_m = _needed(far_m - radius_m, margin_m, blur_m, least_m)
+    close_m = _needed(close_m - radius_m, margin_m, blur_m, least_m)
     for share in shares:
         x, y, yaw = pose
         v, omega = moving
@@ -70,7 +72,8 @@ def _fastest_of_disc(
             x += v * step_s * math.cos(yaw + half_turn)
             y += v * step_s * math.sin(yaw + half_turn)
             yaw += 2.0 * half_turn
-            free = _gap(x, y, borders, nearest) - radius_m >= needed_m
+            gap_m, close_gap_m = _gaps(x, y, borders, nearest, close)
+            free = gap_m - radius_m >= far_m and close_gap_m - radius_m >= close_m
             step += 1
         if free:
             return share
@@ -78,11 +81,32 @@ def _fastest_of_disc(
 
 
 @njit
-def _gap(x: float, y: float, borders: np.ndarray, nearest: np.ndarray) -> float:
-    """Return how far a place is from what is sensed: from everything on the rays from ``nearest`` on, m."""
-    least = math.inf
+def _needed(now_m: float, margin_m: float, blur_m: float, least_m: float) -> float:
+    """Return the clearance that must stay, m, of who has `now_m` of it."""
+    return min(margin_m, max(now_m - blur_m, least_m), now_m)
+
+
+@njit
+def _gaps(x: float, y: float, borders: np.ndarray, nearest: np.ndarray, close: np.ndarray) -> tuple[float, float]:
+    """Return how far a place is from what is sensed, m: from what is not close, and from what is."""
+    far = least = math.inf
     for row in range(len(nearest)):
-        along = x * borders[0, row] + y * borders[1, row]
-        point = max(along, nearest[row])
-        least = min(least, point * (point - 2.0 * along))
-    return math.sqrt(max(least + x * x + y * y, 0.0))
+        squared = _less_place(x, y, borders, nearest, row)
+        if close[row]:
+            least = min(least, squared)
+        else:
+            far = min(far, squared)
+    return _gap(x, y, far), _gap(x, y, least)
+
+
+@njit
+def _less_place(x: float, y: float, borders: np.ndarray, nearest: np.ndarray, row: int) -> float:
+    """Return the squared distance from everything from ``nearest`` on in a direction, less that of the place, m^2."""
+    along = x * borders[0, row] + y * borders[1, row]
+    point = max(along, nearest[row])
+    return point * (point - 2.0 * along)
+
+
+@njit
+def _gap(x: float, y: float, less_place: float) -> float:
+    return math.sqrt(max(less_place + x * x + y * y, 0.0))

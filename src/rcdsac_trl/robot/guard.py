@@ -19,13 +19,7 @@ from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors, check_switches
-from rcdsac_trl.robot.sensed_distances import (
-    outline_distances,
-    outline_ray_distances,
-    place_distances,
-    ray_distances,
-    sensed_within,
-)
+from rcdsac_trl.robot.sensed_distances import outline_distances, place_distances, sensed_within
 from rcdsac_trl.robot.stopping_path import STEP_S, stopping_paths
 
 # Shares of the wanted speed that are tried, the fastest first.
@@ -229,7 +223,7 @@ class Guard:
             return half
         turned = way * BIN_RAD * np.arange(half + 1)
         headings = np.stack((np.cos(turned), np.sin(turned)), axis=1)
-        clearance = self._clearances(np.zeros((1, half + 1, 2)), headings, borders, nearest)[0]
+        clearance = self._clearances(np.zeros((1, half + 1, 2)), headings, borders, nearest)[0].min(axis=-1)
         touching = np.flatnonzero(clearance < min(LEAST_M, float(clearance[0])))
         return int(touching[0]) - 1 if len(touching) else half
 
@@ -261,26 +255,13 @@ class Guard:
         From what is nearer than the least already, such as a mast of the robot's own, it must come no nearer. That
         makes nothing else less worth keeping clear of.
         """
+        clearance = self._clearances(places, headings, borders, nearest)
+        close = clearance[0, 0] < LEAST_M
         kept = np.ones(len(places), np.bool_)
-        close = self._is_close(places[0, 0], headings[0], borders, nearest)
-        for rays in (close, ~close) if close.any() else (slice(None),):
-            if len(nearest[rays]):
-                clearance = self._clearances(places, headings, borders[:, rays], nearest[rays])
-                kept &= clearance.min(axis=1) >= self._needed_m(float(clearance[0, 0]))
+        for group in (clearance[..., close], clearance[..., ~close]):
+            if group.size:
+                kept &= group.min(axis=(1, 2)) >= self._needed_m(float(group[0, 0].min()))
         return kept
-
-    def _is_close(
-        self,
-        place: NDArray[np.float64],
-        heading: NDArray[np.float64],
-        borders: NDArray[np.float64],
-        nearest: NDArray[np.float64],
-    ) -> NDArray[np.bool_]:
-        """Return in which directions what is sensed is nearer to the robot at a place than the least, bool [m]."""
-        if self._is_a_disc:
-            return ray_distances(place, borders, nearest) - self.radius_m < LEAST_M
-        outline = self.robot.outline
-        return outline_ray_distances(outline, place[None, None], heading[None], borders, nearest)[0, 0] < LEAST_M
 
     def _needed_m(self, now_m: float) -> float:
         """Return the clearance that must stay, m, of who has `now_m` of it."""
@@ -345,7 +326,7 @@ class Guard:
         borders: NDArray[np.float64],
         nearest: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return how far the robot is from what is sensed at each place, m, [shares, n].
+        """Return how far the robot is from what is sensed in each direction at each place, m, [shares, n, m].
 
         Args:
             places: of its centre, [shares, n, 2].

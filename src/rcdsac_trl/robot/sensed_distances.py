@@ -27,7 +27,7 @@ def sensed_within(sectors: Sectors, reach_m: float) -> tuple[NDArray[np.float64]
 def place_distances(
     places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how far each place is from what is sensed, m, [...].
+    """Return how far each place is from what is sensed in each direction, m, [..., m].
 
     Args:
         places: [..., 2].
@@ -37,37 +37,17 @@ def place_distances(
     Example:
         >>> ahead = np.array([[1.0], [0.0]])
         >>> place_distances(np.array([[0.0, 0.0], [3.0, 0.5]]), ahead, np.array([2.0]))  # the second one lies behind it
-        array([2. , 0.5])
+        array([[2. ],
+               [0.5]])
     """
-    squared = _squared_less_place(places, borders, nearest).min(axis=-1) + np.square(places).sum(axis=-1)
-    return np.sqrt(np.maximum(squared, 0.0))
-
-
-def ray_distances(
-    places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return how far each place is from what is sensed in each direction, m, [..., m]; see :func:`place_distances`.
-
-    Example:
-        >>> ahead_and_left = np.array([[1.0, 0.0], [0.0, 1.0]])
-        >>> ray_distances(np.zeros(2), ahead_and_left, np.array([2.0, 1.0]))
-        array([2., 1.])
-    """
-    squared = _squared_less_place(places, borders, nearest) + np.square(places).sum(axis=-1)[..., None]
-    return np.sqrt(np.maximum(squared, 0.0))
-
-
-def _squared_less_place(
-    places: NDArray[np.float64], borders: NDArray[np.float64], nearest: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return squared distances less the squared distance of the place from here, [..., m], m^2."""
     along = places @ borders
     point = np.maximum(along, nearest)
     # |place - point u|^2 = |place|^2 + point (point - 2 place u) for a direction u, in few passes over large arrays.
     along *= 2.0
     np.subtract(point, along, out=along)
     along *= point
-    return along
+    along += np.square(places).sum(axis=-1)[..., None]
+    return np.sqrt(np.maximum(along, 0.0))
 
 
 def outline_distances(
@@ -77,7 +57,7 @@ def outline_distances(
     borders: NDArray[np.float64],
     nearest: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return how far a convex body is from what is sensed at each place, m, [k, n]; 0 where they meet.
+    """Return how far a convex body is from what is sensed in each direction at each place, m, [k, n, m]; 0: they meet.
 
     What is sensed in a direction is everything on the ray from `nearest` on. A ray and a convex body that do not meet
     are nearest at the ray's beginning, or at one of the body's corners.
@@ -92,24 +72,13 @@ def outline_distances(
     Example:
         >>> square = np.array([[0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
         >>> places, headings = np.zeros((1, 2, 2)), np.array([[1.0, 0.0], [0.5**0.5, 0.5**0.5]])
-        >>> outline_distances(square, places, headings, np.array([[1.0], [0.0]]), np.array([2.0])).round(3)
+        >>> outline_distances(square, places, headings, np.array([[1.0], [0.0]]), np.array([2.0]))[..., 0].round(3)
         array([[1.5  , 1.293]])
     """
-    return outline_ray_distances(outline, places, headings, borders, nearest).min(axis=-1)
-
-
-def outline_ray_distances(
-    outline: NDArray[np.float64],
-    places: NDArray[np.float64],
-    headings: NDArray[np.float64],
-    borders: NDArray[np.float64],
-    nearest: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return the same of what is sensed in each direction, m, [k, n, m]; see :func:`outline_distances`."""
     cos, sin = headings[:, 0], headings[:, 1]
     turns = np.stack((np.stack((cos, sin), axis=-1), np.stack((-sin, cos), axis=-1)), axis=1)  # [n, frame, map]
     corners = places[:, :, None] + outline @ turns
-    at_corners = ray_distances(corners, borders, nearest).min(axis=2)
+    at_corners = place_distances(corners, borders, nearest).min(axis=2)
     # The rays in the body's frame, [k, n, m, 2].
     begin = np.einsum("nij,snmj->snmi", turns, (borders * nearest).T - places[:, :, None])
     along = np.broadcast_to(np.einsum("nij,jm->nmi", turns, borders), begin.shape)

@@ -136,7 +136,7 @@ def map_evaluator(
     if spec.latency_s:
         policy = _foresighted(spec, policy, len(agent_ids))
         timed.append(policy)
-    if spec.navigation.replan or spec.navigation.watchdog or spec.navigation.stop_zone:
+    if spec.navigation.is_on:
         policy = _navigated(spec, policy, len(agent_ids))
         timed.append(policy)
     if spec.controller is not None:

@@ -71,8 +71,7 @@ def recorded(
     rows = [block * spec.num_episodes + episode for block in range(len(spec.conditions))]
     predictor = None
     # With navigation around it an agent is told, and driven, otherwise than the environment says.
-    alone = not any(vars(spec.navigation).values())
-    if agent is not None and alone and spec.trained.algo.critic == "quantile":
+    if agent is not None and not spec.navigation.is_on and spec.trained.algo.critic == "quantile":
         predictor = QuantilePredictor(unpacked_loss(spec.trained, agent.loss).critics, rows)
     watching: list[Recorder] = []
 
