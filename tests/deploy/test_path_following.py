@@ -176,6 +176,12 @@ def test_what_cannot_be_metres_and_radians_is_refused(path: Any, pose: Any, told
         PathFollower(path, CONFIG).update(pose)
 
 
+@pytest.mark.parametrize("config", [None, {"waypoint_radius_m": 0.5, "goal_radius_m": 0.15}])
+def test_a_follower_without_radii_is_refused_where_it_is_made(config: Any) -> None:
+    with pytest.raises(UserInputError, match=r"has no waypoint_radius_m and goal_radius_m: give policy\.config"):
+        PathFollower([(0.0, 0.0), (2.0, 0.0)], config)
+
+
 def test_a_map_of_large_coordinates_is_one() -> None:
     x, y = 500_000.0, 5_400_000.0  # as projected coordinates of the Earth are
     follower = PathFollower([(x, y), (x + 3.0, y), (x + 3.0, y + 3.0)], CONFIG)

@@ -94,7 +94,7 @@ def test_velocities_of_fast_scans_are_differences_over_20_ms_and_more(tmp_path: 
 def test_a_robotlaser_says_its_own_angles_reach_and_velocities(tmp_path: Path) -> None:
     path = tmp_path / "some.log"
     path.write_text(
-        "ROBOTLASER1 0 -1.0 2.0 0.5 30.0 0.01 0 5 1 2 3 4 5 1 9 7 7 7 1.0 2.0 0.5 0.25 -0.125 0 0 0 100.5 host 0.5\n"
+        "ROBOTLASER1 0 -1.0 2.0 0.5 30.0 0.01 0 5 1 2 3 4 5 1 9 1.0 2.0 0.5 1.0 2.0 0.5 0.25 -0.125 0 0 0 100.5 h 0\n"
     )
     odom, scan = open_recording(path).messages(["/odom", "/scan"])
     assert (scan.message.angle_min, scan.message.angle_increment, scan.message.range_max) == (-1.0, 0.5, 30.0)
@@ -102,6 +102,26 @@ def test_a_robotlaser_says_its_own_angles_reach_and_velocities(tmp_path: Path) -
     assert scan.time_s == 100.5
     assert messages.pose_of_odometry(odom.message) == pytest.approx((1.0, 2.0, 0.5))
     assert messages.velocity_of_odometry(odom.message) == (0.25, -0.125)
+
+
+@pytest.mark.parametrize(
+    ("laser", "mount"),
+    [
+        ("1.0 2.2 1.6", Mount(x_m=0.2, yaw_rad=1.6 - math.pi / 2)),
+        (f"0.9 2.0 {math.pi / 2}", Mount(y_m=0.1)),
+        (f"1.0 2.0 {math.pi / 2}", Mount(x_m=0.15)),  # no mount of its own: what the parameters say
+        (f"7.0 2.0 {math.pi / 2}", Mount(x_m=0.15)),  # poses in two frames
+    ],
+)
+def test_a_robotlaser_says_where_its_scanner_sits(laser: str, mount: Mount, tmp_path: Path) -> None:
+    path = tmp_path / "some.log"
+    path.write_text(
+        "PARAM robot_frontlaser_offset 0.15\n"
+        f"ROBOTLASER1 0 -1.0 2.0 0.5 30.0 0.01 0 2 1 2 0 {laser} 1.0 2.0 {math.pi / 2} 0 0 0 0 0 100.5 host 0.5\n"
+    )
+    found = open_recording(path).mount
+    assert found is not None
+    assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((mount.x_m, mount.y_m, mount.yaw_rad))
 
 
 @pytest.mark.parametrize(

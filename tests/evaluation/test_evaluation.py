@@ -169,6 +169,15 @@ def test_it_refuses_to_overwrite_another_evaluation(run: Path, tmp_path: Path) -
     assert contents(out) == before
 
 
+def test_it_refuses_a_folder_of_somebody_elses_tables(run: Path, tmp_path: Path) -> None:
+    table = tmp_path / "episodes.csv"
+    table.write_text("mine\n1\n")
+    with pytest.raises(UserInputError, match=r"holds tables of something else, episodes\.csv among them: give another"):
+        evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path}")
+    assert [path.name for path in tmp_path.iterdir()] == ["episodes.csv"]
+    assert table.read_text() == "mine\n1\n"
+
+
 def test_results_go_beside_the_run_unless_told_otherwise(run: Path) -> None:
     out = evaluate(f"run={run}", "beta=[-1]", "seed=5", "checkpoint=last")
     assert out == run / "evaluation" / "last-evaluation-seed5-1x2-beta_-1"

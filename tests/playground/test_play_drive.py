@@ -328,6 +328,15 @@ def test_nobody_says_that_beta_turned_where_it_did_not(name: str, beta: str) -> 
         assert driver.helped is None
 
 
+def test_a_turn_too_slow_for_an_action_is_driven(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = Command(0.1, 0.15, False, None, (0.1, 0.15), fresh=True)  # the dead band of actions ends at 0.26 rad/s
+    with driven(0) as scene:
+        monkeypatch.setattr(scene.robots[0].driver, "act", lambda *_: slow)
+        for _ in range(5):
+            scene.step()
+        assert scene.robots[0].arena.situation().velocity == pytest.approx((0.1, 0.15), abs=1e-5)
+
+
 def test_contacts_are_counted_when_they_begin_and_shown_where() -> None:
     with driven(10, agent="sac-narrow") as scene:
         (robot,) = scene.robots

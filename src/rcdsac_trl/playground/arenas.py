@@ -14,7 +14,6 @@ from rcdsac_trl.deploy.policy.path import PathFollower
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.course.course_drive import Conditions, CourseWorld
 from rcdsac_trl.playground.drivers import Situation
-from rcdsac_trl.robot.action import action_of
 from rcdsac_trl.robot.observation import distance_and_bearing
 from rcdsac_trl.robot.planar import placed
 from rcdsac_trl.robot.range_sensor import sensor_mask
@@ -178,7 +177,7 @@ class MapArena:
     def step(self, v: float, omega: float) -> Outcome:
         """Let the robot do what it is told."""
         agent = self._agent
-        agent.step(action_of(v, omega, self.robot))
+        agent.drive(v, omega)
         return Outcome(
             float(total_reward(agent.reward_components)), agent.in_contact, agent.goal_reached, agent.velocities[0]
         )

@@ -13,6 +13,8 @@ from rcdsac_trl.system.resources import check_out
 UNFINISHED = "unfinished"
 """The folder, in a folder of results, of what has ended of work that has not."""
 
+DESCRIPTIONS = ("evaluation.json", "barn.json", "calibration.json", "course.json", "replay.json")
+"""What says of a folder of results what its tables are of."""
 
 # Keys of the description of what is unfinished.
 _ENDED, _TOTAL = "units_ended", "units"
@@ -78,12 +80,22 @@ class ResultsFolder:
 
     def _check(self) -> None:
         check_out(self.path)
+        self._check_ours()
         kind = self._description.stem
         for what, description in ((kind, self._description), (f"unfinished {kind}", self._unfinished / f"{kind}.json")):
             if description.exists() and self._is_another(description):
                 raise UserInputError(
                     f"{self.path} holds the {what} of something else: give another folder with out=<folder>"
                 )
+
+    def _check_ours(self) -> None:
+        """Refuse a folder whose tables nothing here wrote: those of the same name would be lost."""
+        tables = sorted(path.name for path in self.path.glob("*.csv"))
+        if tables and not self._unfinished.is_dir() and not any((self.path / name).is_file() for name in DESCRIPTIONS):
+            raise UserInputError(
+                f"{self.path} holds tables of something else, {tables[0]} among them: give another folder with "
+                "out=<folder>"
+            )
 
     def _is_another(self, description: Path) -> bool:
         """Say whether a description is of something else; one that cannot be read is."""

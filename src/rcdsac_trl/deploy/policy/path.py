@@ -51,7 +51,8 @@ class PathFollower:
         reached: whether the goal was reached.
 
     Raises:
-        UserInputError: if the path holds no point, or no numbers, or is not in metres, or the tolerance is not.
+        UserInputError: if the path holds no point, or no numbers, or is not in metres, or the tolerance is not, or the
+            config has no radii.
 
     Example:
         >>> from types import SimpleNamespace
@@ -65,6 +66,8 @@ class PathFollower:
             raise UserInputError(
                 f"tolerance_m={tolerance_m} is outside [0, {_LARGEST_TOLERANCE_M:g}], a path would be cut: give metres"
             )
+        if not all(is_finite_number(getattr(config, name, None)) for name in ("waypoint_radius_m", "goal_radius_m")):
+            raise UserInputError(f"config={config!r} has no waypoint_radius_m and goal_radius_m: give policy.config")
         self._config = config
         self._tolerance_m = tolerance_m
         self._line = self._line_of(path)

@@ -31,6 +31,7 @@ from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.guard import Guard
+from rcdsac_trl.robot.latency import Ahead
 from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.robot.sectors import Sectors
 
@@ -414,6 +415,7 @@ class Policy:
         elapsed_s = 0.0 if forgot else self._periods.elapsed_s(stamps)
         fresh = self._periods.is_due(stamps)
         self._periods.accept(stamps, fresh)
+        ahead = self._observer.ahead(measured, self._periods.time_s)
         if fresh:
             self._advice, self._turned_to = None, None
             if self.navigator is not None:
@@ -423,9 +425,9 @@ class Policy:
                 next_two, asked = self._advice.waypoints, context
                 context = bolder(self.config, asked, self._advice.boldness)
                 self._turned_to = context if context != asked else None
-            seen = self._observer.observe(sectors, next_two, measured, elapsed_s, self._periods.time_s)
+            seen = self._observer.observe(sectors, next_two, measured, elapsed_s, ahead)
             self._see(*seen, context)
-        return self._command(sectors, measured, fresh, fresh and forgot, on_map)
+        return self._command(sectors, measured, ahead, fresh, fresh and forgot, on_map)
 
     def _see(
         self, bins: NDArray[np.float32], vectors: Sequence[float] | NDArray[np.float32], context: float | None
@@ -438,6 +440,7 @@ class Policy:
         self,
         sectors: Sectors,
         measured: tuple[float, float],
+        ahead: Ahead,
         fresh: bool,
         forgot: bool,
         on_map: "Pose | None",
@@ -452,7 +455,7 @@ class Policy:
                 v, omega = self._advice.instead
                 told = ["it stood still and backs off; the agent drives on then"]
         if self.guard is not None:
-            wish, ahead = (v, omega), self._observer.ahead(measured, self._periods.time_s)
+            wish = v, omega
             reach_m = self.guard.reach_m(abs(v), ahead)
             known = self._known(sectors, on_map, reach_m)
             v, omega, reason = self.guard.limit(*wish, known, measured, been, ahead)

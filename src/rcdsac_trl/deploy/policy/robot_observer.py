@@ -72,7 +72,7 @@ class RobotObserver:
         waypoints: tuple[tuple[float, float], tuple[float, float]],
         measured: tuple[float, float],
         elapsed_s: float,
-        at_s: float = 0.0,
+        ahead: Ahead,
     ) -> tuple[NDArray[np.float32], list[float]]:
         """Return the range observation, float32 [180], and all vector observations, one behind the other.
 
@@ -81,16 +81,15 @@ class RobotObserver:
             waypoints: the next two, x and y in m, robot's frame.
             measured: velocities, m/s and rad/s.
             elapsed_s: since the last observation, 0 at the first, s.
-            at_s: when the velocities were measured, s; read where there is a latency.
+            ahead: where the robot will be, as :meth:`ahead` says.
         """
         bins = range_observation(sectors.distances_m, self.mask, self._robot.lidar.max_range_m)
-        told, ahead = measured, None
         if self._latency is not None:
-            ahead = self.ahead(measured, at_s)
             first, second = ahead.seen(np.array(waypoints)).tolist()
-            waypoints, told = (tuple(first), tuple(second)), ahead.velocities
-        vectors = [*waypoint_observation(AT_ORIGIN, *waypoints), *told, *self.commanded]
+            waypoints = tuple(first), tuple(second)
+        vectors = [*waypoint_observation(AT_ORIGIN, *waypoints), *ahead.velocities, *self.commanded]
         if self._remembered is not None:
             distances_m, covered = sectors.distances_m, sectors.covered
-            vectors += self._remembered.observe(distances_m, *measured, elapsed_s, covered, ahead).tolist()
+            told = None if self._latency is None else ahead
+            vectors += self._remembered.observe(distances_m, *measured, elapsed_s, covered, told).tolist()
         return bins, vectors

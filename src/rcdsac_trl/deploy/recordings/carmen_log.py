@@ -1,7 +1,8 @@
 """Logs of CARMEN, the Carnegie Mellon robot navigation toolkit: lines of text, as many public data sets are.
 
 Read are ``FLASER`` (or ``ROBOTLASER1``), ``ODOM`` and the ``PARAM`` lines that say how the scanner sits and how far it
-reaches. A ``FLASER`` does not say its angles: it is half a turn, from the right to the left.
+reaches. A ``FLASER`` does not say its angles: it is half a turn, from the right to the left. A ``ROBOTLASER1`` says how
+its scanner sits, too, by the poses of scanner and robot; the first one counts.
 """
 
 import itertools
@@ -11,8 +12,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from rcdsac_trl.deploy.recordings.sensor_recording import ODOMETRY, SCAN, RecordedMessage
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.planar import seen_from
 from rcdsac_trl.robot.sectors import Mount
 
 SCAN_TOPIC, ODOM_TOPIC = "/scan", "/odom"
@@ -41,14 +45,16 @@ class CarmenLog:
         self.path = path
         self._range_max_m = _USUAL_RANGE_MAX_M
         self.mount: Mount | None = Mount()
-        keywords = set()
+        first: dict[str, list[str]] = {}  # line of each kind
         for number, words in self._lines():
-            keywords.add(words[0])
+            first.setdefault(words[0], words)
             if words[0] == "PARAM" and len(words) > 2:
                 self._take_parameter(number, words[1], words[2])
-        self._scans = "ROBOTLASER1" if "FLASER" not in keywords else "FLASER"
-        self._has_odometry = "ODOM" in keywords
-        self.topics: Mapping[str, str] = {SCAN_TOPIC: SCAN, ODOM_TOPIC: ODOMETRY} if self._scans in keywords else {}
+        self._scans = "ROBOTLASER1" if "FLASER" not in first else "FLASER"
+        if self._scans in first and self._scans == "ROBOTLASER1":
+            self.mount = _mount_of(first[self._scans]) or self.mount
+        self._has_odometry = "ODOM" in first
+        self.topics: Mapping[str, str] = {SCAN_TOPIC: SCAN, ODOM_TOPIC: ODOMETRY} if self._scans in first else {}
         if self._has_odometry:
             self.topics = {**self.topics, ODOM_TOPIC: ODOMETRY}
 
@@ -141,15 +147,31 @@ def _robotlaser(words: list[str]) -> Read:
     """Read ``ROBOTLASER1``: angles, reach, n and readings, m and remissions, two poses, velocities, .., a stamp."""
     start, resolution, range_max_m = float(words[2]), float(words[4]), float(words[5])
     rays = int(words[8])
-    ranges = [float(word) for word in words[9 : 9 + rays]]
-    remissions = int(words[9 + rays])
-    rest = words[10 + rays + remissions :]
-    if len(ranges) < rays or len(rest) < 12:
-        raise ValueError(f"it says {rays} readings and has {len(words) - 9} words behind")
+    ranges, rest = [float(word) for word in words[9 : 9 + rays]], _behind_readings(words)
     pose = (float(rest[3]), float(rest[4]), float(rest[5]))
     velocity = (float(rest[6]), float(rest[7]))
     stamp_s = float(rest[11])
     return _scan(stamp_s, ranges, start, resolution, range_max_m), pose, velocity, stamp_s
+
+
+def _behind_readings(words: list[str]) -> list[str]:
+    """Return what stands behind the readings and remissions of a ``ROBOTLASER1``."""
+    rays = int(words[8])
+    rest = words[10 + rays + int(words[9 + rays]) :]
+    if len(rest) < 12:
+        raise ValueError(f"it says {rays} readings and has {len(words) - 9} words behind")
+    return rest
+
+
+def _mount_of(words: list[str]) -> Mount | None:
+    """Return where the scanner of a ``ROBOTLASER1`` sits; None if its poses say nothing of that."""
+    try:
+        x, y, yaw, *robot = map(float, _behind_readings(words)[:6])
+        ahead_m, left_m = seen_from(np.array([[x, y]]), (robot[0], robot[1], robot[2]))[0].tolist()
+        mount = Mount(ahead_m, left_m, math.remainder(yaw - robot[2], 2.0 * math.pi))
+    except (ValueError, IndexError, OverflowError):  # not to be read, or poses in two frames: no mount is so far away
+        return None
+    return None if mount == Mount() else mount  # logs of robots that do not know write one pose twice
 
 
 def _scan(stamp_s: float, ranges: list[float], angle_min: float, increment: float, range_max_m: float) -> Any:

@@ -150,9 +150,13 @@ class NavigationAgent:
         self._sense(elapsed_s=0.0)
 
     def step(self, action: Sequence[float]) -> None:
-        """Take one agent step."""
+        """Take one agent step with the desired velocities of an action."""
+        self.drive(*desired_velocities(action, self._robot))
+
+    def drive(self, v_u: float, omega_u: float) -> None:
+        """Take one agent step with desired velocities, m/s and rad/s, slow turns that no action stands for included."""
         simulation, task, disturbances = self.simulation, self._task, self._disturbances
-        v_u, omega_u = self._guarded(*desired_velocities(action, self._robot))
+        v_u, omega_u = self._guarded(v_u, omega_u)
         self._delayed.append((v_u, omega_u))
         v, omega = self._delayed.popleft()
         reached = 1.0 - disturbances.motor_slowness
