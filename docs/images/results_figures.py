@@ -1,19 +1,28 @@
-"""Draw beta_response.png, beta_response_cvar.png and differences_collisions.png, of what results/ holds.
+"""Draw beta_trainings.png, beta_response.png, beta_response_cvar.png and differences_collisions.png, of what results/ holds.
 
 python docs/images/results_figures.py
 """
 
 from pathlib import Path
 
+import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.comparison_figures import paired_differences
+from rcdsac_trl.report.panels import include_zero
 from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.response_figures import beta_response
+from rcdsac_trl.report.style import style
 
 HERE = Path(__file__).parent
 RESULTS = HERE.parents[1] / "results"
 REFERENCE = "sac"
+# At which CVaR's agents for one beta were trained.
+_BETAS_OF_DSAC = (0.25, 0.75)
+# Rows that the paper's table lacks, left out of the differences.
+BESIDE = ("rcdsac_pow_wide", "pursuit")
 # Agents first, then what they are compared with; others behind them.
 ORDER = ("rcdsac_pow", "rcdsac_cvar", "dsac", "rcwr", "sac", "pursuit")
 
@@ -23,14 +32,70 @@ def place(run: Path) -> int:
     return next((i for i, name in enumerate(ORDER) if run.name.startswith(name)), len(ORDER))
 
 
+def beta_trainings() -> Figure:
+    """Draw collisions and reward of all trainings of CVaR over beta, beside SAC's and MPPI's."""
+    figure = Figure(figsize=(11.0, 5.2), layout="constrained")
+    rows = zip(("collisions", "reward"), ("collisions an episode", "reward an episode"), strict=True)
+    for (metric, heading), panels in zip(rows, figure.subplots(2, 2, sharex=True, sharey="row"), strict=True):
+        for sensor, axes in zip(("narrow", "sparse"), panels, strict=True):
+            _draw_trainings(axes, metric, sensor)
+            first = metric == "collisions"
+            title = f"{heading}, {sensor} sensor" if first else heading
+            style(axes, title, "" if first else "β: averse at the left, neutral at the right")
+            if first:
+                include_zero(axes)
+    return figure
+
+
+def _draw_trainings(axes: Axes, metric: str, sensor: str) -> None:
+    """Draw a line for each training and one for their mean, and level lines of who has no beta."""
+    trained = [_means(run, metric).dropna() for run in _trainings(f"rcdsac_cvar-{sensor}")]
+    by_training = pd.concat(trained, axis=1, join="inner")
+    axes.plot(by_training, color=LIGHT.robot, linewidth=1.0, alpha=0.45)
+    mean = by_training.mean(axis=1)
+    axes.plot(mean, color=LIGHT.robot, linewidth=2.4, marker="o", markersize=6)
+    others = {"SAC": ("sac", LIGHT.alarm, "--"), "MPPI": ("mppi", LIGHT.ink, ":")}
+    levels = {
+        name: float(pd.concat([_means(run, metric) for run in _trainings(f"{agent}-{sensor}")]).mean())
+        for name, (agent, _, _) in others.items()
+    }
+    for name, (_, color, line) in others.items():
+        axes.axhline(levels[name], color=color, linestyle=line, linewidth=1.6)
+    for beta in _BETAS_OF_DSAC:
+        of_one = pd.concat([_means(run, metric) for run in _trainings(f"dsac_cvar_{beta}-{sensor}")])
+        axes.plot([beta] * len(of_one), of_one, color=LIGHT.goal, marker=".", markersize=5, linestyle="none", alpha=0.6)
+        axes.plot(beta, of_one.mean(), color=LIGHT.goal, marker="D", markersize=7)
+    texts = {name: (level, others[name][1]) for name, level in levels.items()}
+    if metric == "collisions":
+        texts["RC-DSAC"] = float(mean.iloc[-1]), LIGHT.robot
+        at = (_BETAS_OF_DSAC[-1], float(of_one.mean()))
+        axes.annotate("DSAC", at, xytext=(8, -4), textcoords="offset points", fontsize=9, color=LIGHT.goal)
+    for name, (level, color) in texts.items():
+        place = (1.01, level)
+        axes.annotate(name, place, xycoords=("axes fraction", "data"), va="center", fontsize=9, color=color)
+    axes.set_xticks(mean.index)
+
+
+def _trainings(name: str) -> list[Path]:
+    """Return the folders of all trainings of an agent, or of a baseline."""
+    return [RESULTS / name, *sorted(RESULTS.glob(f"seed-*/{name}"))]
+
+
+def _means(run: Path, metric: str) -> pd.Series:
+    """Return the mean of a metric at each beta; of who has none under NaN."""
+    episodes = read_episodes([run])
+    return episodes.table.groupby("beta", dropna=False)[metric].mean()
+
+
 def main() -> None:
     """Read, draw."""
     # An agent or a baseline a folder; those of the study lie deeper, or are called otherwise.
     narrow = sorted(RESULTS.glob("*-narrow"), key=lambda run: (place(run), run))
-    episodes = read_episodes(narrow)
+    episodes = read_episodes([run for run in narrow if not run.name.startswith(BESIDE)])
     of_both_sensors = read_episodes([*narrow, *sorted(RESULTS.glob("*-sparse"))])
     reference = episodes.conditions["agent"].tolist().index(REFERENCE)
     figures: dict[str, Figure | None] = {
+        "beta_trainings": beta_trainings(),
         "beta_response": beta_response(of_both_sensors, "pow"),
         "beta_response_cvar": beta_response(of_both_sensors, "cvar"),
         "differences_collisions": paired_differences(episodes, reference, "collisions"),

@@ -71,7 +71,7 @@ def world_figure(measured: Mapping[str, Any]) -> Figure:
     for axes, (key, words) in zip(figure.subplots(2, 2).flat, panels.items(), strict=True):
         draw_curve(axes, *numbers(measured[key]))
         style(axes, *words)
-    head(figure, "How rate and memory grow with what one may turn")
+    head(figure, "Agent steps a second, and memory of the replay")
     return figure
 
 

@@ -63,7 +63,7 @@ VERBS = {
         does="measure an agent, or a hand-written controller, on unseen maps",
         examples={
             "run=runs/<folder>": "a run, at the values of beta of its row",
-            "run=rcdsac_pow-narrow beta=[-2,-0.5] map=hard": "a shipped agent, on another map set",
+            "run=rcdsac_cvar-narrow beta=[0.25,1] map=hard": "a shipped agent, on another map set",
             "baseline=mppi num_maps=10": "a classical planner, on fewer maps",
         },
         keys=("acting",),
@@ -88,7 +88,7 @@ VERBS = {
         does="hold the quantiles that critics predict against returns really earned",
         examples={
             "run=runs/<folder>": "at the values of beta of its row",
-            "run=runs/<folder> as_driven=true split=validation": "as it acts: `publish` makes told quantiles true",
+            "run=runs/<folder> as_driven=true split=validation": "as it acts: `publish` recalibrates by it",
             "run=runs/<folder> cross_evaluate=true num_maps=80 num_states=1 num_rollouts=32": "is each beta's policy "
             "the best by its own measure?",
         },
@@ -121,7 +121,7 @@ VERBS = {
     "course": Verb(
         does="drive agents over the office course with simulated depth cameras",
         examples={
-            "run=rcdsac_pow-narrow beta=[-2,-1]": "a shipped agent at two values of beta",
+            "run=rcdsac_cvar-narrow beta=[0.25,1]": "a shipped agent at two values of beta",
             "run=runs/<folder> repetitions=1 record=true": "your agent once, with a film",
             "baseline=pursuit": "a controller that sees nothing, alone",
         },
@@ -148,7 +148,7 @@ VERBS = {
     "verify": Verb(
         does="measure shipped agents again, and say whether their cards' numbers hold",
         examples={
-            "seed=7": "those of the wheel, on maps of your choosing: about 5 minutes on two cores",
+            "seed=7": "those of the wheel, on maps of your choosing: about 7 minutes on two cores",
             "rcdsac_pow-narrow num_maps=100": "one agent, more surely",
             "sac-narrow seed=0 num_maps=50 num_episodes=5": "on the card's own maps",
         },

@@ -11,7 +11,7 @@ from rcdsac_trl.playground.scene_choice import NOBODY, SceneChoice, shortened
 
 _CAREFUL = 0.25
 _EVENTFUL = "hard"
-# With the agents that ship, the neutral robot alone touches something there within ten seconds.
+# With the agents that ship, the neutral robot alone touches something there within 15 seconds.
 _SHOWS_BETA = 28
 # What a link may say of the page itself.
 _SWITCH = ("on", "off")

@@ -29,7 +29,7 @@ class ActingSettings:
         num_candidates: actions that the critics choose among, tanh(mean) one of them; 1: tanh(mean) itself.
         spread: how far from the mean the others lie, in standard deviations of the policy.
         over_critics: what counts of what the critics say of one: the smallest value, or the mean.
-        margin_m: while they choose, they are told that all that is foreseen is so much nearer, m; needs heads that look
+        margin_m: while they choose, foreseen clearances are smaller by this safety margin, m; needs heads that look
             ahead.
 
     Raises:
@@ -65,7 +65,7 @@ class ActingSettings:
         return (
             f"the best of {self.num_candidates} actions within {self.spread:g} x the policy's spread, by the "
             f"{self.over_critics} over its critics"
-            + (f", told that all is {100.0 * self.margin_m:g} cm nearer" if self.margin_m > 0.0 else "")
+            + (f", with a safety margin of {100.0 * self.margin_m:g} cm" if self.margin_m > 0.0 else "")
         )
 
     def check_heads(self, look_ahead: bool) -> None:

@@ -77,14 +77,15 @@ def model_card(config: AgentConfig, num_parameters: int, measured: Measured | No
         num_parameters: how many numbers were learnt.
         measured: what is known of how it drives.
     """
-    told = "nothing besides observations"
+    told = "none"
     if config.context is not None and config.context_range is not None:
         told = f"`{config.context}` in [{config.context_range[0]:g}, {config.context_range[1]:g}]"
     if config.fixed_beta is not None:
         told += f"; it was trained for beta = {config.fixed_beta:g} alone"
     origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items() if value is not None)
     remembered = f", what it saw in the last {config.memory_s:g} s" if config.memory_s > 0.0 else ""
-    tells = "" if config.recalibration is None else f"| tells | quantiles of the return, {config.recalibration} |\n"
+    reported = "raw, not recalibrated" if config.recalibration is None else str(config.recalibration)
+    reports = f"| reports | quantiles of the return, {reported} |\n" if config.critic == "quantile" else ""
     driving = "" if measured is None else f"\n{driving_section(measured)}\n"
     sentences = limits_of(config) if measured is None else measured.limits
     limits = "\n".join(f"- {sentence}" for sentence in sentences)
@@ -103,11 +104,11 @@ policy = rcdsac_trl.load("this/folder")
 |---|---|
 | drives | `{config.robot.name}`, {_described(config.robot)} |
 | reads | {NUM_BINS} range bins of which the `{config.sensor}` sensor has some, two waypoints, velocities{remembered} |
-| is told | {told} |
+| input besides | {told} |
 | risk measure | {config.measure} |
 | acts every | {config.period_s[0]:g} to {config.period_s[1]:g} s |
 | acts by | {config.acting} |
-{tells}| gives | linear velocity in m/s, angular velocity in rad/s |
+{reports}| gives | linear velocity in m/s, angular velocity in rad/s |
 {origin}
 {driving}
 ## Limits
@@ -132,15 +133,15 @@ def driving_section(measured: Measured) -> str:
         parts.append(f"What is hit, times an episode:\n\n{_collision_table(measured)}".rstrip())
     if measured.calibration:
         parts.append(
-            "What the critics expect, against returns really earned (all: true quantiles would show the fraction):\n\n"
+            "What the critics predict, beside realised returns (all: true quantiles would show the fraction):\n\n"
             f"{_calibration_table(measured)}".rstrip()
         )
     if measured.told_calibration:
         first = measured.told_calibration[0]
         driven = f"{first['num_maps']} evaluation maps x {first['num_episodes']} episodes (seed {first['seed']})"
         parts.append(
-            f"What it tells of its return while it drives, against what it earns on {driven}; raw is what its critics "
-            f"say:\n\n{_told_table(measured)}".rstrip()
+            f"The return that it reports while it drives, beside what it earns on {driven}; raw: as its critics "
+            f"predict:\n\n{_told_table(measured)}".rstrip()
         )
     return "\n\n".join(parts)
 
@@ -192,7 +193,7 @@ def _calibration_table(measured: Measured) -> str:
         for entry in measured.calibration
     ]
     covered = [f"returns below the quantile of {float(fraction):.0%}" for fraction in fractions]
-    return markdown_table(["β", "depth of the worst tenth, expected", "earned", *covered], rows)
+    return markdown_table(["β", "depth of the worst tenth, predicted", "realised", *covered], rows)
 
 
 def _told_table(measured: Measured) -> str:
@@ -207,7 +208,13 @@ def _told_table(measured: Measured) -> str:
         for entry in sorted(measured.told_calibration, key=lambda entry: (entry["beta"] or 0.0, entry["told"] != "raw"))
     ]
     covered = [f"below the {float(fraction):.0%} quantile" for fraction in measured.told_calibration[0]["coverage"]]
-    headings = ["β", "quantiles", "mean return, told / earned", "depth of the worst tenth, told / earned", *covered]
+    headings = [
+        "β",
+        "quantiles",
+        "mean return, predicted / realised",
+        "depth of the worst tenth, predicted / realised",
+        *covered,
+    ]
     return markdown_table(headings, rows)
 
 
