@@ -232,7 +232,7 @@ class ReferenceLoss(LossModule):
 
     def _error(self, value: Tensor, target: Tensor, tau: Tensor | None) -> Tensor:
         if tau is None:
-            return F.smooth_l1_loss(value, target, reduction="none")
+            return 0.5 * (value - target).square()
         kappa = self.settings.kappa
         difference = target.unsqueeze(-2) - value.unsqueeze(-1)
         size = difference.abs()

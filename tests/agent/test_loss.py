@@ -20,6 +20,7 @@ from rcdsac_trl.agent.actor import build_actor, build_critic
 from rcdsac_trl.agent.loss.distributional_sac import DistributionalSACLoss
 from rcdsac_trl.agent.loss.functional import _quantile_huber_pairwise, quantile_huber_loss, squash
 from rcdsac_trl.agent.loss.loss_settings import LossSettings
+from rcdsac_trl.agent.loss.samples import LossSamples
 from rcdsac_trl.agent.loss.target_updates import FusedSoftUpdate
 from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.agent.risk import CVaR, Neutral, PowerLaw, RiskMeasure
@@ -685,6 +686,7 @@ def test_scalar_mode_equals_torchrls_sac() -> None:
         [ValueOperator(copy.deepcopy(c), in_keys=["observation", "action"]) for c in critics],
         alpha_init=0.3,
         target_entropy=-2.0,
+        loss_function="l2",  # without the half
     )
     theirs.make_value_estimator(gamma=0.9)
 
@@ -728,6 +730,7 @@ def test_scalar_mode_equals_torchrls_sac() -> None:
         sequence[key] = torch.stack((transition[key], transition[key]), dim=1)
     torch.manual_seed(5)  # both draw the next action's noise first, then the action's
     expected, found = theirs(transition), ours(sequence)
+    expected["loss_qvalue"] = 0.5 * expected["loss_qvalue"]
     for key in (*LOSSES, "alpha", "entropy"):
         torch.testing.assert_close(found[key], expected[key], rtol=1e-5, atol=1e-6)
     for losses in (expected, found):
@@ -739,3 +742,18 @@ def test_scalar_mode_equals_torchrls_sac() -> None:
             critic.layers[0].weight.grad, theirs.qvalue_network_params["module", "layers", "0", "weight"].grad[k]
         )
     torch.testing.assert_close(ours.log_alpha.grad, theirs.log_alpha.grad)
+
+
+def test_a_scalar_critic_learns_the_mean_of_a_rare_collision() -> None:
+    """Of a target that is 0, and -10 in one case of twenty, the error is least at the mean, -0.5."""
+    loss = make_loss("sac")
+    target = torch.zeros(1, 20, 1)
+    target[0, 0] = -10.0
+    value = torch.zeros(1, 1, 1, requires_grad=True)
+    samples = LossSamples(torch.empty(0), None, None, torch.empty(0), None)
+    optimiser = torch.optim.SGD([value], lr=0.5)
+    for _ in range(60):
+        optimiser.zero_grad()
+        loss.critic_error(value.expand_as(target), target, samples).mean().backward()
+        optimiser.step()
+    assert value.item() == pytest.approx(-0.5, abs=1e-4)

@@ -8,7 +8,6 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
-from torch.nn import functional as F
 from torchrl.objectives.utils import _reduce
 from torchrl.objectives.value.functional import td0_return_estimate
 
@@ -37,7 +36,7 @@ class DistributionalSACLoss(LinkedLoss):
       :math:`r_t + \gamma(\min_k \hat Z^{\prime k}_{\tau'_j}(s_{t+1}, a; \beta) - \alpha \log\pi(a|s_{t+1},\beta))`,
       with a policy action :math:`a` and the element-wise minimum (or what ``target_over_critics`` says) over the target
       critics; summed over the critics. With ``n_steps`` above 1 the rewards and entropies of the steps on the way come
-      first;
+      first. Of a scalar critic: half the squared difference (Haarnoja et al., 2018, equation 5);
     - actor: :math:`\alpha \log\pi - \min_k \frac1K \sum_j \hat Z^k_{\psi(\tau_j;\beta)}(s_t, a; \beta)`;
     - temperature: :math:`-\log\alpha \, (\log\pi + \bar H)`.
 
@@ -252,7 +251,8 @@ class DistributionalSACLoss(LinkedLoss):
     def critic_error(self, value: Tensor, target: Tensor, samples: LossSamples) -> Tensor:
         """Return a critic's share of the critic loss, ``[B, L - burn_in]``."""
         if samples.tau is None:
-            return F.smooth_l1_loss(value, target, reduction="none").squeeze(-1)
+            # Squares alone lead to the mean: a Huber loss would hardly mind a collision that is not certain.
+            return 0.5 * (value - target).square().squeeze(-1)
         return quantile_huber_loss(value, target, samples.tau, self.settings.kappa)
 
     def actor_loss(
