@@ -1,8 +1,9 @@
-"""Draw beta_trainings.png, beta_response.png, beta_response_cvar.png and differences_collisions.png, of what results/ holds.
+"""Draw beta_trainings, beta_response, beta_response_cvar and differences_collisions.png, of what results/ holds.
 
 python docs/images/results_figures.py
 """
 
+import math
 from pathlib import Path
 
 import pandas as pd
@@ -70,10 +71,20 @@ def _draw_trainings(axes: Axes, metric: str, sensor: str) -> None:
         texts["RC-DSAC"] = float(mean.iloc[-1]), LIGHT.robot
         at = (_BETAS_OF_DSAC[-1], float(of_one.mean()))
         axes.annotate("DSAC", at, xytext=(8, -4), textcoords="offset points", fontsize=9, color=LIGHT.goal)
-    for name, (level, color) in texts.items():
-        place = (1.01, level)
-        axes.annotate(name, place, xycoords=("axes fraction", "data"), va="center", fontsize=9, color=color)
+    _label_at_the_right(axes, texts)
     axes.set_xticks(mean.index)
+
+
+def _label_at_the_right(axes: Axes, texts: dict[str, tuple[float, str]]) -> None:
+    """Write names, each with its level and colour, behind the axes; of two that are near the upper one goes up."""
+    low, high = axes.get_ylim()
+    near = 0.06 * (high - low)
+    ordered = sorted(texts.items(), key=lambda item: item[1][0])
+    levels = [-math.inf, *(level for _, (level, _) in ordered), math.inf]
+    for number, (name, (level, color)) in enumerate(ordered, 1):
+        below, above = level - levels[number - 1] < near, levels[number + 1] - level < near
+        va = "bottom" if below else "top" if above else "center"
+        axes.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), va=va, fontsize=9, color=color)
 
 
 def _trainings(name: str) -> list[Path]:
