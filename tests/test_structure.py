@@ -15,9 +15,11 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 import rcdsac_trl
+from rcdsac_trl.agent.loss.loss_settings import LossSettings
 from rcdsac_trl.agent.networks import NetworkSettings
 from rcdsac_trl.agent.risk import MEASURES
 from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
+from rcdsac_trl.config.learner_settings import LearnerSettings
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.robot.range_sensor import SENSORS
 from rcdsac_trl.rollout.environments import environment
@@ -282,6 +284,9 @@ def test_the_code_has_the_defaults_of_the_configuration() -> None:
     assert conf("map/mixed.yaml") == as_lists(asdict(MapSettings()))
     assert conf("task/default.yaml") == as_lists(asdict(TaskSettings()))
     assert conf("train.yaml")["network"] == asdict(NetworkSettings())
+    learner = conf("train.yaml")["learner"]
+    assert {name: learner[name] for name in asdict(LossSettings())} == asdict(LossSettings())
+    assert learner["mirror"] == LearnerSettings.mirror
 
 
 def test_every_map_set_gives_every_setting() -> None:

@@ -39,7 +39,7 @@ def in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_parts, "_TRANSITIONS_PER_PART", SEQUENCES * STEPS)
 
 
-@pytest.mark.parametrize("settings", [{}, {"fractions_per": "transition", "burn_in": 1}, {"reduction": "sum"}])
+@pytest.mark.parametrize("settings", [{}, {"fractions_per": "sequence", "burn_in": 1}, {"reduction": "sum"}])
 @pytest.mark.parametrize("kind", ["rcdsac", "sac"])
 def test_parts_give_the_losses_and_gradients_of_the_whole(
     kind: str, settings: dict, monkeypatch: pytest.MonkeyPatch

@@ -29,7 +29,9 @@ from rcdsac_trl.robot.observation import VECTOR_OBSERVATIONS
 SMALL = NetworkSettings(conv=4, range=8, vector=4, memory=6, head=5, cosines=7)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_alpha")
 #: Of the losses computed by hand.
-LINEAR = LossSettings(num_quantiles=3, num_target_quantiles=2, num_risk_samples=4, alpha_init=0.2)
+LINEAR = LossSettings(
+    num_quantiles=3, num_target_quantiles=2, num_risk_samples=4, fractions_per="sequence", alpha_init=0.2
+)
 Reduction = Literal["mean", "sum", "none"]
 
 
@@ -427,7 +429,8 @@ def test_fractions_per_transition_and_per_sequence() -> None:
 
 
 def test_stratified_fractions_fall_into_a_part_each_and_are_uniform_in_it() -> None:
-    loss = make_loss(fraction_sampling="stratified", num_quantiles=7, num_target_quantiles=4, num_risk_samples=2)
+    numbers = {"num_quantiles": 7, "num_target_quantiles": 4, "num_risk_samples": 2}
+    loss = make_loss(fractions_per="sequence", fraction_sampling="stratified", **numbers)
     batch = make_batch().repeat(400, 1)
     samples = loss.draw_samples(batch)
     for fractions, number in ((samples.tau, 7), (samples.next_tau, 4), (samples.risk_tau, 2)):
@@ -476,7 +479,7 @@ def test_dsac_is_told_beta_by_the_measure_alone() -> None:
 
 def test_distortion_strength_tempers_beta_in_the_distortion_alone() -> None:
     """At strength 0 the actor's loss is that of the mean, though the networks are still told every beta."""
-    loss, batch = make_loss(), make_batch()
+    loss, batch = make_loss(fractions_per="sequence"), make_batch()
     state = loss.rng_state
 
     def losses(strength: float, measure: RiskMeasure, batch: TensorDict) -> TensorDictBase:

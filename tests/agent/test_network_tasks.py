@@ -28,7 +28,7 @@ VARIANTS: list[dict[str, Any]] = [
     {"number": 1},
     {"number": 3, "target_over_critics": "smaller"},
     {"reduction": "sum", "n_steps": 3},
-    {"burn_in": 1, "fractions_per": "transition", "target_over_critics": "mean"},
+    {"burn_in": 1, "fractions_per": "sequence", "target_over_critics": "mean"},
 ]
 
 

@@ -53,11 +53,11 @@ class LossSettings:
     num_quantiles: int = 16
     num_target_quantiles: int = 16
     num_risk_samples: int = 16
-    fractions_per: DrawnPer = "sequence"
+    fractions_per: DrawnPer = "transition"
     fraction_sampling: FractionSampling = "uniform"
     n_steps: int = 1
     kappa: float = 1.0
-    alpha_init: float = 1.0
+    alpha_init: float = 0.05
     target_entropy: float = -2.0
     burn_in: int = 0
     target_over_critics: OverCritics = "minimum"
