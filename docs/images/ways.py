@@ -20,7 +20,6 @@ from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.rollout.make_agent import packed, packed_loss
 from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
 from rcdsac_trl.rollout.measurement import table_of
-from rcdsac_trl.world.task.world_settings import WorldSettings
 
 AGENT = "rcdsac_cvar-narrow"
 EPISODES_A_MAP, MOST_MAPS = 5, 50
@@ -33,18 +32,9 @@ def spec_of(name: str) -> tuple[EvaluationSpec, Agent]:
     conditions = trained.algo.conditions(None, None)
     if len({condition.beta for condition in conditions}) < 2:
         raise SystemExit(f"{name} is not driven at two betas: name an agent that is risk-conditioned")
-    world = WorldSettings(
-        map_settings=trained.map,
-        task=trained.task,
-        sensor=trained.sensor.name,
-        memory_s=trained.sensor.memory_s,
-        num_agents=EPISODES_A_MAP * len(conditions),
-        num_workers=0,
-        robot=trained.robot,
-    )
     spec = EvaluationSpec(
         trained=trained,
-        world=world,
+        world=trained.world_for(EPISODES_A_MAP * len(conditions)),
         conditions=conditions,
         split="validation",
         seed=0,

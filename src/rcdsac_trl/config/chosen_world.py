@@ -15,6 +15,7 @@ from rcdsac_trl.world.maps.generator import MapSettings
 from rcdsac_trl.world.maps.map_mixture import MapMixture
 from rcdsac_trl.world.maps.map_source import MapSource, check_maps
 from rcdsac_trl.world.task.rules import TaskSettings
+from rcdsac_trl.world.task.world_settings import WorldSettings
 
 Section = TypeVar("Section", SensorSettings, TaskSettings, RobotSettings)
 
@@ -35,6 +36,22 @@ class ChosenWorld(NamedTuple):
     task: TaskSettings
     robot: RobotSettings
     barn: BarnMapSettings | None = None
+
+    def world_for(self, num_agents: int) -> WorldSettings:
+        """Return what so many agents drive in, side by side in one process.
+
+        Raises:
+            UserInputError: as :class:`~rcdsac_trl.world.task.world_settings.WorldSettings`.
+        """
+        return WorldSettings(
+            map_settings=self.maps,
+            task=self.task,
+            sensor=self.sensor.name,
+            memory_s=self.sensor.memory_s,
+            num_agents=num_agents,
+            num_workers=0,
+            robot=self.robot,
+        )
 
     def check_maps(self) -> None:
         """Refuse files that maps cannot be made from, before anything is driven; BARN's goals are given.

@@ -23,7 +23,6 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.listening import check_can_listen
 from rcdsac_trl.system.resources import check_empty, check_out, check_writable
 from rcdsac_trl.world.maps.map_source import check_maps
-from rcdsac_trl.world.task.world_settings import WorldSettings
 
 
 def look_at_evaluation(cfg: DictConfig) -> None:
@@ -40,7 +39,7 @@ def look_at_evaluation(cfg: DictConfig) -> None:
     settings.conditions_of(trained)
     settings.latency_of(trained)
     chosen = settings.world_of(trained)
-    WorldSettings(chosen.maps, chosen.task, chosen.sensor.name, chosen.sensor.memory_s, robot=chosen.robot)
+    chosen.world_for(settings.num_episodes)  # refuses a robot that does not fit
     chosen.check_maps()
     _look_at_out(settings.out)
 

@@ -2,7 +2,7 @@
 
 import importlib
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -210,21 +210,27 @@ class TrainingSettings:
     @property
     def training_world(self) -> WorldSettings:
         """What the training environment is made of."""
-        return WorldSettings(
-            map_settings=self.map,
-            task=self.task,
-            sensor=self.sensor.name,
-            memory_s=self.sensor.memory_s,
-            num_agents=self.world.num_agents,
-            num_workers=self.world.num_workers,
-            worker_timeout_s=self.world.worker_timeout_s,
-            robot=self.robot,
+        team = self.world
+        return replace(
+            self.world_for(team.num_agents), num_workers=team.num_workers, worker_timeout_s=team.worker_timeout_s
         )
 
     @property
     def sensor_mask(self) -> NDArray[np.bool_]:
         """Which of the 180 range bins the agent is told, bool [180]."""
         return self.robot.sensor_mask(self.sensor.name)
+
+    def world_for(self, num_agents: int) -> WorldSettings:
+        """Return what so many agents drive in as in training, side by side in one process."""
+        return WorldSettings(
+            map_settings=self.map,
+            task=self.task,
+            sensor=self.sensor.name,
+            memory_s=self.sensor.memory_s,
+            num_agents=num_agents,
+            num_workers=0,
+            robot=self.robot,
+        )
 
     def replay_steps(self, inherited_steps: int = 0) -> int:
         """Return the steps that the replay is made for: no more than the run can fill.

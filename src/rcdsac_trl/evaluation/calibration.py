@@ -33,7 +33,6 @@ from rcdsac_trl.system.progress import Watch
 from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
 from rcdsac_trl.world.task.rules import RULES_VERSION
-from rcdsac_trl.world.task.world_settings import WorldSettings
 
 Measurer = tuple[Callable[[], AbstractContextManager[Drive]], Callable[[Rows], Findings]]
 """What makes the driver of a process, and what makes tables of all rows."""
@@ -107,18 +106,9 @@ def _as_driven(
     simulations = sets * len(conditions) * settings.num_episodes
     remedy = "lower num_episodes or num_workers, give fewer values of beta, or end other programs"
     resources.check_memory(f"{simulations} simulations", simulations * SIMULATION_BYTES, remedy)
-    world = WorldSettings(
-        map_settings=trained.map,
-        task=trained.task,
-        sensor=trained.sensor.name,
-        memory_s=trained.sensor.memory_s,
-        robot=trained.robot,
-        num_agents=settings.num_episodes * len(conditions),
-        num_workers=0,  # a process drives whole maps
-    )
     spec = EvaluationSpec(
         trained=trained,
-        world=world,
+        world=trained.world_for(settings.num_episodes * len(conditions)),
         conditions=conditions,
         split=settings.split,
         seed=settings.seed,
@@ -202,18 +192,9 @@ def _driver(
     runtime.set_threads(_threads(settings))
     loss = unpacked_loss(trained, weights)
     group = settings.num_states * settings.num_rollouts
-    world = WorldSettings(
-        map_settings=trained.map,
-        task=trained.task,
-        sensor=trained.sensor.name,
-        memory_s=trained.sensor.memory_s,
-        robot=trained.robot,
-        num_agents=group * len(conditions),
-        num_workers=0,  # a process drives whole maps
-    )
     states = [state for state in range(settings.num_states) for _ in range(settings.num_rollouts)]
     env = environment(
-        world,
+        trained.world_for(group * len(conditions)),
         trained.algo,
         split=settings.split,
         seed=settings.seed,

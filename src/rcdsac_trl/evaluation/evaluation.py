@@ -1,7 +1,7 @@
 """Evaluation: the same maps, starts and goals for every agent, its mean actions or its choice, one row an episode."""
 
 from collections.abc import Generator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,6 @@ from rcdsac_trl.system.provenance import commit
 from rcdsac_trl.world.maps.map_source import with_digests
 from rcdsac_trl.world.sim.bullet import check_display
 from rcdsac_trl.world.sim.simulation import SIMULATION_BYTES
-from rcdsac_trl.world.task.world_settings import WorldSettings
 
 
 def make_evaluation(cfg: DictConfig) -> MeasuredRun:
@@ -110,9 +109,10 @@ def make_evaluation(cfg: DictConfig) -> MeasuredRun:
 
 def _spec(settings: EvaluationSettings, trained: TrainingSettings, chosen: ChosenWorld) -> EvaluationSpec:
     conditions = settings.conditions_of(trained)
+    world = chosen.world_for(settings.num_episodes * len(conditions))
     return EvaluationSpec(
         trained=trained,
-        world=_evaluation_world(settings, chosen, len(conditions)),
+        world=replace(world, map_settings=with_digests(chosen.maps), gui=settings.gui),
         conditions=conditions,
         split=settings.split,
         seed=settings.seed,
@@ -197,17 +197,4 @@ def _findings(rows: Rows) -> Findings:
             "summary.csv": summary.to_csv(index=False, float_format="%.6g"),
             "collisions.csv": collisions.to_csv(index=False, float_format="%.6g"),
         }
-    )
-
-
-def _evaluation_world(settings: EvaluationSettings, chosen: ChosenWorld, num_conditions: int) -> WorldSettings:
-    return WorldSettings(
-        map_settings=with_digests(chosen.maps),
-        task=chosen.task,
-        sensor=chosen.sensor.name,
-        memory_s=chosen.sensor.memory_s,
-        num_agents=settings.num_episodes * num_conditions,
-        num_workers=0,  # a process drives whole maps
-        gui=settings.gui,
-        robot=chosen.robot,
     )

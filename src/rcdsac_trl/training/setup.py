@@ -262,7 +262,7 @@ def _pending(
 
 
 def _snapshot_evaluator(settings: TrainingSettings, device: str, threads: int) -> SnapshotEvaluator:
-    world, given = replace(settings.training_world, num_workers=0), settings.validation
+    world, given = settings.world_for(settings.world.num_agents), settings.validation
     course = EvaluationSpec(
         trained=settings,
         world=world,
@@ -282,5 +282,5 @@ def _snapshot_evaluator(settings: TrainingSettings, device: str, threads: int) -
         steps=world.task.episode_steps,
         processes=beside,
         processes_alone=alone,
-        timeout_s=world.worker_timeout_s,
+        timeout_s=settings.world.worker_timeout_s,
     )
