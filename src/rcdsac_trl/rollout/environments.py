@@ -1,6 +1,7 @@
 """Environments and workers with everything a policy reads."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from torchrl.envs import EnvBase, InitTracker, StepCounter, TransformedEnv
 
@@ -91,31 +92,28 @@ def _sampler(
     """Make what tells the agents their beta or collision weight; None where they are told nothing."""
     if algo is None or algo.context_key is None:
         return None
-    fixed: list[float] | None = None
+    asked = conditions or ()
+    draw: Callable[[float], float]
     if algo.collision_weight is not None:
-        low, high = algo.collision_weight
-        if conditions is not None:
-            fixed = [c.collision_weight for c in conditions if c.collision_weight is not None]
-        return EpisodeSampler(
-            "collision_weight",
-            lambda u: low + (high - low) * u,
-            seed=seed,
-            agent_ids=agent_ids,
-            first_episode=first_episode,
-            fixed=fixed,
-        )
-    measure = algo.distortion.measure
-    if conditions is not None:
+        draw = partial(_between, *algo.collision_weight)
+        fixed = [c.collision_weight for c in asked if c.collision_weight is not None]
+    else:
+        measure = algo.distortion.measure
+        draw = measure.from_uniform
         # A controller tells its agents at every step; they must be told something before.
-        fixed = [measure.low if c.beta is None else c.beta for c in conditions if c.beta is not None or c.controller]
+        fixed = [measure.low if c.beta is None else c.beta for c in asked if c.beta is not None or c.controller]
     return EpisodeSampler(
-        "risk",
-        measure.from_uniform,
+        algo.context_key,
+        draw,
         seed=seed,
         agent_ids=agent_ids,
         first_episode=first_episode,
-        fixed=fixed,
+        fixed=None if conditions is None else fixed,
     )
+
+
+def _between(low: float, high: float, share: float) -> float:
+    return low + (high - low) * share
 
 
 def evaluation_worker(
