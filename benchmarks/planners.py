@@ -21,8 +21,8 @@ def seconds(name: str, steps: int) -> float:
     import torch
     from tensordict import TensorDictBase
 
+    from rcdsac_trl.robot.limits import MEAN_PERIOD_S
     from rcdsac_trl.rollout.planners.baselines import baseline_policy
-    from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
     from rcdsac_trl.rollout.timed import Timed
     from rcdsac_trl.world.task.env import make_env
 
@@ -30,7 +30,7 @@ def seconds(name: str, steps: int) -> float:
     env = make_env(split="validation", agent_ids=agent_ids, num_workers=0)
     policy = baseline_policy(name, sensor="narrow", agent_ids=agent_ids, seed=0)
     if isinstance(policy, Timed):
-        policy.set_periods([PERIOD_S] * len(agent_ids))
+        policy.set_periods([MEAN_PERIOD_S] * len(agent_ids))
     taken = []
     observed: TensorDictBase = env.reset()
     for step in range(steps + steps // 10):

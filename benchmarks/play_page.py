@@ -21,6 +21,8 @@ from dataclasses import dataclass
 
 from playwright.sync_api import Page, sync_playwright
 
+from rcdsac_trl.robot.limits import MEAN_PERIOD_S
+
 SCENES = {
     "one robot": "agent=rcdsac_cvar-narrow&map=hard",
     "as it opens": "",
@@ -28,7 +30,6 @@ SCENES = {
 }
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 SETTLE_S = 2.0
-PERIOD_S = 0.14  # of an agent step, on average
 PATIENCE_MS = 300_000
 SWITCHES = ("--headless", "--no-sandbox", "--disable-gpu")
 _MOVES = "parseFloat(document.querySelector('#robot0 [data-field=time]')?.textContent) > 0.2"
@@ -85,7 +86,7 @@ def rates(page: Page, address: str, query: str, seconds: float) -> Rates:
     page.wait_for_timeout(1000 * seconds)
     shown, driven_s = (now - then for now, then in zip(_so_far(page), before, strict=True))
     elapsed_s = time.perf_counter() - start
-    return Rates(shown / elapsed_s, robots, robots * driven_s / PERIOD_S / elapsed_s)
+    return Rates(shown / elapsed_s, robots, robots * driven_s / MEAN_PERIOD_S / elapsed_s)
 
 
 def _so_far(page: Page) -> tuple[float, float]:

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.action import clip_command, desired_velocities
-from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
+from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MEAN_PERIOD_S, MOTOR_PERIOD_S
 from rcdsac_trl.robot.range_sensor import Sensor, sensor_mask
 from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.rollout.planners.controller import Controller
-from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
 from rcdsac_trl.world.maps.geometry import ROBOT_RADIUS_M
 from rcdsac_trl.world.sim.lidar import sector_distances
 
@@ -73,7 +72,7 @@ class Scene:
 
     def drive(self, controller: Controller, steps: int, seed: int = 0) -> "Scene":
         """Let a controller drive from rest, until it is at the goal or the steps are over."""
-        controller.reset(self.sensed, np.random.default_rng(seed), PERIOD_S)
+        controller.reset(self.sensed, np.random.default_rng(seed), MEAN_PERIOD_S)
         for _ in range(steps):
             self.move(*controller.act(*self.observation()))
             if self.distance_to_goal_m() < 0.15:

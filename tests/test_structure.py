@@ -21,6 +21,7 @@ from rcdsac_trl.agent.risk import MEASURES
 from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
 from rcdsac_trl.config.learner_settings import LearnerSettings
 from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.deploy.policy.distortion import NUM_REPORTED_QUANTILES
 from rcdsac_trl.robot.range_sensor import SENSORS
 from rcdsac_trl.rollout.environments import environment
 from rcdsac_trl.world.maps.files.barn import BarnMapSettings
@@ -287,6 +288,7 @@ def test_the_code_has_the_defaults_of_the_configuration() -> None:
     learner = conf("train.yaml")["learner"]
     assert {name: learner[name] for name in asdict(LossSettings())} == asdict(LossSettings())
     assert learner["mirror"] == LearnerSettings.mirror
+    assert conf("export.yaml")["num_quantiles"] == NUM_REPORTED_QUANTILES
 
 
 def test_every_map_set_gives_every_setting() -> None:

@@ -33,7 +33,7 @@ FILES = PROGRAMS | {"README.md", "config.json", "training.yaml", "weights.safete
 def test_programs_of_the_paper_s_size_agree_over_1000_steps_at_every_beta(name: str) -> None:
     remembers = {"restart_steps": 4, "memory_s": 12.0, "look_ahead": True} if name == "rcdsac_cvar" else {}
     weights = full_size(**ROWS[name], **remembers)
-    found = differences(export_agent(weights), weights, betas=betas_of(weights))
+    found = differences(export_agent(weights, 16), weights, betas=betas_of(weights))
     assert max(found.values()) <= LIMIT, found
 
 

@@ -19,7 +19,7 @@ from rcdsac_trl.deploy.navigation.cost_to_go import cost_to_go
 from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
-from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MOTOR_PERIOD_S
+from rcdsac_trl.robot.limits import MAX_LINEAR_VELOCITY, MEAN_PERIOD_S, MOTOR_PERIOD_S
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
 from rcdsac_trl.robot.range_sensor import sensor_mask
@@ -29,7 +29,6 @@ from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
 from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
 from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
 from rcdsac_trl.rollout.planners.trajectory_costs import (
-    PERIOD_S,
     CostSettings,
     PlannerSettings,
     TrajectoryCosts,
@@ -56,7 +55,7 @@ def turned(local_map: LocalMap, scene: Scene, turn: float, steps: int) -> None:
     local_map.observe(scene.observation()[0])
     for _ in range(steps):
         scene.move(0.0, math.copysign(PAPER.max_angular_velocity, turn))
-        local_map.move(*scene.velocity[:2], PERIOD_S)
+        local_map.move(*scene.velocity[:2], MEAN_PERIOD_S)
         local_map.observe(scene.observation()[0])
 
 
@@ -88,7 +87,7 @@ def test_odometry_is_the_integral_of_measured_velocities() -> None:
     scene, local_map = Scene(), LocalMap(LocalMapSettings(), NARROW)
     for step in range(60):
         scene.move(0.5, 0.9 if step % 20 < 10 else -0.4)
-        local_map.move(*scene.velocity[:2], PERIOD_S)
+        local_map.move(*scene.velocity[:2], MEAN_PERIOD_S)
     assert math.dist(local_map.pose[:2], scene.pose[:2]) < 0.05
     assert abs(math.remainder(local_map.pose[2] - scene.pose[2], 2 * math.pi)) < 0.05
 
@@ -118,7 +117,7 @@ def test_it_forgets_after_its_time(steps: int, known: bool) -> None:
     local_map.observe(seen)
     local_map.sensed[0] = False  # looks away for good
     for _ in range(steps):
-        local_map.move(0.0, 0.0, PERIOD_S)
+        local_map.move(0.0, 0.0, MEAN_PERIOD_S)
         local_map.observe(NOTHING)
     assert (local_map.distance_m(1.0, 0.0) <= WITHIN_A_CELL_M) == known
 
@@ -169,16 +168,16 @@ def test_a_contact_that_is_not_seen_is_felt() -> None:
 def tracked(velocity: tuple[float, float], steps: int, sensor: NDArray[np.bool_] = NARROW) -> MoverTracks:
     tracks = MoverTracks(TrackSettings(), sensor)
     for step in range(steps):
-        x, y = (start + speed * PERIOD_S * step for start, speed in zip((1.8, -0.5), velocity, strict=True))
+        x, y = (start + speed * MEAN_PERIOD_S * step for start, speed in zip((1.8, -0.5), velocity, strict=True))
         scene = Scene(circles=[(x, y, 0.25)], segments=[(2.9, -3.0, 2.9, 3.0)])
-        tracks.observe(scene.observation()[0], np.zeros(3), PERIOD_S)
+        tracks.observe(scene.observation()[0], np.zeros(3), MEAN_PERIOD_S)
     return tracks
 
 
 def test_a_disc_that_walks_is_tracked_with_its_velocity() -> None:
     (x, y, vx, vy, radius, unseen_s), *others = tracked((0.0, 0.4), steps=15).moving
     assert not others
-    assert (x, y) == pytest.approx((1.8, -0.5 + 0.4 * PERIOD_S * 14), abs=0.1)
+    assert (x, y) == pytest.approx((1.8, -0.5 + 0.4 * MEAN_PERIOD_S * 14), abs=0.1)
     assert (vx, vy) == pytest.approx((0.0, 0.4), abs=0.12)
     assert radius == TrackSettings().radius_m
     assert unseen_s == 0.0
@@ -193,8 +192,8 @@ def test_what_stands_behind_a_robot_that_sees_all_around_and_turns_does_not_move
     tracks = MoverTracks(TrackSettings(), full)
     pillar = np.array([(-1.3, 0.0, 0.3)])
     for step in range(100):
-        pose = np.array([0.0, 0.0, 0.4 * math.sin(0.6 * PERIOD_S * step)])
-        tracks.observe(sector_distances(*pose, np.empty((0, 4)), pillar), pose, PERIOD_S, full)
+        pose = np.array([0.0, 0.0, 0.4 * math.sin(0.6 * MEAN_PERIOD_S * step)])
+        tracks.observe(sector_distances(*pose, np.empty((0, 4)), pillar), pose, MEAN_PERIOD_S, full)
         assert len(tracks.moving) == 0
 
 
@@ -206,9 +205,9 @@ def test_a_track_goes_on_unseen_for_its_time() -> None:
     tracks = tracked((0.0, 0.4), steps=15)
     before = tracks.moving[0]
     for _ in range(14):  # 1.96 s
-        tracks.observe(NOTHING, np.zeros(3), PERIOD_S)
-    assert tracks.moving[0, :2] == pytest.approx(before[:2] + 14 * PERIOD_S * before[2:4])
-    tracks.observe(NOTHING, np.zeros(3), PERIOD_S)
+        tracks.observe(NOTHING, np.zeros(3), MEAN_PERIOD_S)
+    assert tracks.moving[0, :2] == pytest.approx(before[:2] + 14 * MEAN_PERIOD_S * before[2:4])
+    tracks.observe(NOTHING, np.zeros(3), MEAN_PERIOD_S)
     assert len(tracks.moving) == 0
 
 
@@ -224,7 +223,7 @@ def test_what_is_seen_now_stays_where_a_track_only_guesses() -> None:
     local_map = LocalMap(LocalMapSettings(), NARROW)
     local_map.observe(Scene(circles=[DISC]).observation()[0], guess)
     assert local_map.distance_m(1.0, 0.0) <= WITHIN_A_CELL_M
-    local_map.move(0.0, 0.0, PERIOD_S)
+    local_map.move(0.0, 0.0, MEAN_PERIOD_S)
     local_map.observe(np.full(180, 0.5), guess)  # looks at something nearer
     assert local_map.distance_m(1.0, 0.0) > 0.4
 
@@ -255,7 +254,7 @@ def test_the_cost_to_go_leads_around_a_wall_through_its_door() -> None:
 
 
 # ------------------------------------------------------------------------------------------------ trajectories
-@pytest.mark.parametrize("period_s", [MOTOR_PERIOD_S, PERIOD_S])
+@pytest.mark.parametrize("period_s", [MOTOR_PERIOD_S, MEAN_PERIOD_S])
 def test_the_motion_model_is_the_motor_controllers(period_s: float) -> None:
     velocities = list(itertools.product((-0.2, 0.0, 0.1, 0.6), (-1.5, -0.3, 0.0, 0.9)))
     for (v_u, omega_u), (v, omega) in itertools.product(velocities, repeat=2):
@@ -305,7 +304,7 @@ def test_what_was_seen_and_is_out_of_view_still_costs() -> None:
             known.observe(*scene.observation())
         assert np.isinf(scene.observation()[0]).all()
         back_to_it = np.full((1, 20, 2), (0.6, 0.0))
-        turn = round(scene.pose[2] / PAPER.max_angular_velocity / PERIOD_S)
+        turn = round(scene.pose[2] / PAPER.max_angular_velocity / MEAN_PERIOD_S)
         back_to_it[0, :turn] = 0.0, -PAPER.max_angular_velocity
         costs[memory_s] = known.of(back_to_it)[0]
     assert costs[8.0] > costs[0.5] + CostSettings().collision_m
@@ -326,7 +325,7 @@ def test_who_walks_into_the_way_costs_and_who_has_walked_out_does_not() -> None:
     for start, speed in ((-1.0, 0.4), (0.0, 0.4)):
         known = TrajectoryCosts(PlannerSettings(), NARROW, 20)
         for step in range(12):
-            y = start + speed * PERIOD_S * (step - 11)
+            y = start + speed * MEAN_PERIOD_S * (step - 11)
             known.observe(*Scene(circles=[(1.8, y, 0.25)], waypoints=((5.0, 0.0), (5.0, 0.0))).observation())
         assert len(known.tracks.moving) == 1
         costs[start] = known.of(drive)[0]
@@ -339,7 +338,7 @@ def test_who_walks_into_the_way_costs_and_who_has_walked_out_does_not() -> None:
 def test_open_space_is_driven_straight(make: Callable[[], Controller], sensor: str) -> None:
     scene = Scene(sensor=sensor)  # type: ignore[arg-type]
     controller = make()
-    controller.reset(scene.sensed, np.random.default_rng(0), PERIOD_S)
+    controller.reset(scene.sensed, np.random.default_rng(0), MEAN_PERIOD_S)
     beside = []
     for _ in range(60):
         scene.move(*controller.act(*scene.observation()))
@@ -349,7 +348,7 @@ def test_open_space_is_driven_straight(make: Callable[[], Controller], sensor: s
     assert scene.distance_to_goal_m() < 0.15
     assert max(beside) < 0.1
     # 3.85 m at 0.6 m/s, to which it speeds up in 0.4 s.
-    assert len(beside) * PERIOD_S < 1.15 * (3.85 / MAX_LINEAR_VELOCITY + 0.2)
+    assert len(beside) * MEAN_PERIOD_S < 1.15 * (3.85 / MAX_LINEAR_VELOCITY + 0.2)
 
 
 @pytest.mark.parametrize("make", PLANNERS)
@@ -404,7 +403,7 @@ def told(name: str, agent_ids: list[int], seed: int = 0) -> ControllerPolicy:
     """Return the policy of a planner that is told how long a step takes."""
     policy = baseline_policy(name, sensor="narrow", agent_ids=agent_ids, seed=seed)
     assert isinstance(policy, ControllerPolicy)
-    policy.set_periods([PERIOD_S] * len(agent_ids))
+    policy.set_periods([MEAN_PERIOD_S] * len(agent_ids))
     return policy
 
 

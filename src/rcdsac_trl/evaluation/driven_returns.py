@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from rcdsac_trl.deploy.policy.distortion import fractions_of
+from rcdsac_trl.deploy.policy.distortion import NUM_REPORTED_QUANTILES, fractions_of
 from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.evaluation.measured_run import Findings
 from rcdsac_trl.rollout.evaluation_pool import Drive, Rows
 from rcdsac_trl.rollout.make_agent import unpacked_loss
 from rcdsac_trl.rollout.map_evaluator import Agent, EvaluationSpec, map_evaluator
-from rcdsac_trl.rollout.quantile_predictor import NUM_QUANTILES, QuantilePredictor
+from rcdsac_trl.rollout.quantile_predictor import QuantilePredictor
 from rcdsac_trl.rollout.worker import RolloutWorker
 from rcdsac_trl.world.task.agent_group import AgentGroup
 
@@ -146,11 +146,11 @@ def driven_findings(recalibration: Recalibration | None, rows: Rows) -> Findings
     rows = sorted(rows, key=lambda row: (row["beta"] or 0.0, row["map"], row["state"]))
     states = pd.DataFrame({key: row[key] for key in _STATE} for row in rows)
     said = np.stack([row["quantiles"] for row in rows])
-    columns = {f"q{number}": said[:, number] for number in range(NUM_QUANTILES)}
+    columns = {f"q{number}": said[:, number] for number in range(NUM_REPORTED_QUANTILES)}
     if recalibration is not None:
-        telling = recalibration.at(fractions_of(NUM_QUANTILES))
+        telling = recalibration.at(fractions_of(NUM_REPORTED_QUANTILES))
         told = np.stack([telling.tell(row["quantiles"], row["beta"]) for row in rows])
-        columns |= {f"told{number}": told[:, number] for number in range(NUM_QUANTILES)}
+        columns |= {f"told{number}": told[:, number] for number in range(NUM_REPORTED_QUANTILES)}
     earned = states.assign(rollout=0, discounted_reward=[row["discounted_reward"] for row in rows])
     predictions = pd.concat([states, pd.DataFrame(columns)], axis=1)
     return Findings(

@@ -16,8 +16,6 @@ from rcdsac_trl.rollout.planners.dwa import Dwa
 from rcdsac_trl.rollout.planners.mppi import Mppi
 from rcdsac_trl.seeding import stream
 
-NUM_QUANTILES = 16
-"""At so many fractions the page shows the return."""
 # Up to this share of its range a dial is near its low end, and from that on near its high one.
 _NEAR_LOW, _NEAR_HIGH = 0.3, 0.95
 
@@ -154,7 +152,7 @@ class AgentDriver:
         if sensor is not None:
             weights = replace(weights, config=replace(weights.config, sensor=sensor))
         config = weights.config
-        self.policy = Policy(weights, guard=None, num_quantiles=NUM_QUANTILES)
+        self.policy = Policy(weights, guard=None)
         self.robot, self.sensor, self.memory_s = config.robot, config.sensor, config.memory_s
         self._forget_help()
         self.fixed_beta = config.fixed_beta

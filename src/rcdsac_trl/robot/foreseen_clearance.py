@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.robot.action import desired_velocities
+from rcdsac_trl.robot.limits import MEAN_PERIOD_S
 from rcdsac_trl.robot.look_ahead import FORESEEN_ACTIONS, FORESEEN_SPAN_M
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
@@ -24,7 +25,6 @@ MIRRORED_COMMANDS: NDArray[np.intp] = np.array(
 )
 """Which command each one is in the mirrored world, intp [22]."""
 
-_PERIOD_S = 0.14
 # Steps of the horizons: 0.42 and 1.4 s.
 _SOON, _LATER = 3, 10
 
@@ -50,10 +50,10 @@ class ForeseenClearance:
 
     def __init__(self, robot: RobotSettings = PAPER) -> None:
         self.commands: NDArray[np.float64] = np.array([desired_velocities(action, robot) for action in _ACTIONS])
-        self._changes = robot.max_acceleration_m_per_s2 * _PERIOD_S, robot.max_angular_acceleration * _PERIOD_S
+        self._changes = robot.max_acceleration_m_per_s2 * MEAN_PERIOD_S, robot.max_angular_acceleration * MEAN_PERIOD_S
         self._inner_radius_m = robot.body_radius_m
         # No command leads farther than this from where the robot is.
-        self._reach_m = robot.fastest_m_per_s * _PERIOD_S * _LATER
+        self._reach_m = robot.fastest_m_per_s * MEAN_PERIOD_S * _LATER
 
     def nearness(
         self,
@@ -118,8 +118,8 @@ def _foresee(
             before_v, before_omega = speed, turning
             speed = _towards(speed, commands[command, 0], changes[0])
             turning = _towards(turning, commands[command, 1], changes[1])
-            half_turn = 0.25 * (before_omega + turning) * _PERIOD_S
-            moved_m = 0.5 * (before_v + speed) * _PERIOD_S
+            half_turn = 0.25 * (before_omega + turning) * MEAN_PERIOD_S
+            moved_m = 0.5 * (before_v + speed) * MEAN_PERIOD_S
             x += moved_m * math.cos(yaw + half_turn)
             y += moved_m * math.sin(yaw + half_turn)
             yaw += 2.0 * half_turn
@@ -127,7 +127,7 @@ def _foresee(
                 dx, dy = near[row, 0] - x, near[row, 1] - y
                 least_m2 = min(least_m2, dx * dx + dy * dy)
             for mover in moving:
-                time_s = step * _PERIOD_S
+                time_s = step * MEAN_PERIOD_S
                 dx, dy = mover[0] + time_s * mover[2] - pose[0] - x, mover[1] + time_s * mover[3] - pose[1] - y
                 least_m = min(least_m, math.hypot(dx, dy) - mover[4])
             if step in (_SOON, _LATER):

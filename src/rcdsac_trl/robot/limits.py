@@ -1,4 +1,4 @@
-"""Limits and motor period of the paper's robot (section "Actions"); see :class:`.robot_settings.RobotSettings`."""
+"""Limits and periods of the paper's robot (section "Actions"); see :class:`.robot_settings.RobotSettings`."""
 
 # Actions (paper, section "Actions").
 MIN_LINEAR_VELOCITY = -0.2
@@ -27,3 +27,7 @@ MAX_TURN_ACCELERATION_DEG_PER_S2 = 120.0
 
 MOTOR_PERIOD_S = 0.02
 """Control period of the motor controller, Delta t."""
+
+
+MEAN_PERIOD_S = 0.14
+"""Mean control period of an agent. An episode's is 6, 7 or 8 motor periods: 0.12, 0.14 or 0.16 s."""

@@ -8,10 +8,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor
 
 from rcdsac_trl.agent.kernels import dispatch
-from rcdsac_trl.deploy.policy.distortion import fractions_of
-
-NUM_QUANTILES = 16
-"""Quantiles that are read of a prediction; a :class:`rcdsac_trl.deploy.Policy` tells as many."""
+from rcdsac_trl.deploy.policy.distortion import NUM_REPORTED_QUANTILES, fractions_of
 
 
 class QuantilePredictor:
@@ -28,7 +25,7 @@ class QuantilePredictor:
     """
 
     def __init__(
-        self, critics: Sequence[TensorDictSequential], rows: Sequence[int], num_quantiles: int = NUM_QUANTILES
+        self, critics: Sequence[TensorDictSequential], rows: Sequence[int], num_quantiles: int = NUM_REPORTED_QUANTILES
     ) -> None:
         self.rows = torch.tensor(list(rows), device="cpu")
         self._critics = critics

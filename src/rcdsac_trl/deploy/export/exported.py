@@ -57,7 +57,7 @@ class Exported:
     runners: dict[str, tuple[Runner, Runner]]
 
 
-def export_agent(weights: Weights, num_quantiles: int = 16) -> Exported:
+def export_agent(weights: Weights, num_quantiles: int) -> Exported:
     """Return an agent's programs for batches of 1, and what runs each pair (actor, critics) of them.
 
     Args:

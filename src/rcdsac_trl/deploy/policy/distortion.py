@@ -14,6 +14,9 @@ from rcdsac_trl.robot.sectors import is_whole_number
 
 Doubles = NDArray[np.float64]
 
+NUM_REPORTED_QUANTILES = 16
+"""Quantiles of a return's distribution that an agent reports, unless it is asked for another number."""
+
 
 def fractions_of(num_quantiles: int) -> NDArray[np.float32]:
     """Return the midpoints of equal parts of [0, 1], float32 [num_quantiles].

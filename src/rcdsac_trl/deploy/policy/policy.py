@@ -11,7 +11,7 @@ from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.command import Command, Outlook
 from rcdsac_trl.deploy.policy.context import bolder, context_of, middle_of_range
 from rcdsac_trl.deploy.policy.control_periods import ControlPeriods
-from rcdsac_trl.deploy.policy.distortion import fractions_of
+from rcdsac_trl.deploy.policy.distortion import NUM_REPORTED_QUANTILES, fractions_of
 from rcdsac_trl.deploy.policy.input_checks import (
     BadInputError,
     InputLimits,
@@ -114,7 +114,7 @@ class Policy:
         *,
         guard: Guard | Literal["robot"] | None = "robot",
         limits: InputLimits = InputLimits(),  # noqa: B008 (frozen)
-        num_quantiles: int = 16,
+        num_quantiles: int = NUM_REPORTED_QUANTILES,
         navigator: "Navigator | None" = None,
         acting: ActingSettings | None = None,
         latency_s: float = 0.0,

@@ -12,13 +12,13 @@ from tensordict.nn import TensorDictModuleBase
 
 from rcdsac_trl.config.baseline_name import PURSUIT, OwnClass, own_class
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.limits import MEAN_PERIOD_S
 from rcdsac_trl.robot.observation import AT_ORIGIN, waypoint_observation
 from rcdsac_trl.robot.range_sensor import NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.rollout.planners.controller import Controller, ControllerPolicy
 from rcdsac_trl.rollout.planners.dwa import Dwa, DwaSettings
 from rcdsac_trl.rollout.planners.mppi import Mppi, MppiSettings
-from rcdsac_trl.rollout.planners.trajectory_costs import PERIOD_S
 from rcdsac_trl.rollout.policies import PursuitPolicy
 
 _PLANNERS: Mapping[str, Callable[[RobotSettings], Controller]] = {
@@ -60,7 +60,7 @@ def check_baseline(name: str, sensor: str, robot: RobotSettings = PAPER) -> None
     policy = baseline_policy(name, sensor=sensor, agent_ids=[0], seed=0, robot=robot)
     if not isinstance(policy, ControllerPolicy) or own_class(name) is None:
         return
-    policy.set_periods([PERIOD_S])
+    policy.set_periods([MEAN_PERIOD_S])
     ahead = waypoint_observation(AT_ORIGIN, (5.0, 0.0), (5.0, 0.0))
     seen = {
         "range": torch.zeros(1, NUM_BINS),

@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 from rcdsac_trl.deploy.navigation.cost_to_go import cost_to_go
 from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.limits import MEAN_PERIOD_S
 from rcdsac_trl.robot.mover_tracks import MoverTracks, TrackSettings
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.system.jit import njit
 from rcdsac_trl.world.task.rules import MIN_TURN_FACTOR, STRAIGHT_FACTOR, TURN_SCALE, TaskSettings
-
-PERIOD_S = 0.14
-"""Step of the trajectories, s: the mean control period of the paper's task. An episode's is 0.12, 0.14 or 0.16 s."""
 
 # Waypoints nearer to each other are one: the goal.
 _SAME_M = 1e-3
@@ -101,7 +99,7 @@ class TrajectoryCosts:
     Args:
         settings: what it remembers and what counts.
         sensed: which of the 180 sectors the sensor has, bool [180].
-        steps: of the trajectories, :data:`PERIOD_S` each.
+        steps: of the trajectories, :data:`~rcdsac_trl.robot.limits.MEAN_PERIOD_S` each.
         robot: that drives; its circumcircle stands for it.
         period_s: from one observation to the next, s.
 
@@ -116,7 +114,7 @@ class TrajectoryCosts:
         sensed: NDArray[np.bool_],
         steps: int,
         robot: RobotSettings = PAPER,
-        period_s: float = PERIOD_S,
+        period_s: float = MEAN_PERIOD_S,
     ) -> None:
         self.local_map = LocalMap(settings.local_map, sensed, robot.lidar.max_range_m)
         self.tracks = MoverTracks(settings.tracks, sensed, robot.lidar.max_range_m)
@@ -134,7 +132,7 @@ class TrajectoryCosts:
         self._prices = np.zeros((n, n))
         self._ways = np.zeros((2, n, n))
         self._waypoints = np.zeros((2, 2))
-        self._reach_m = robot.max_speed_m_per_s * PERIOD_S * steps + settings.cost.waypoint_radius_m
+        self._reach_m = robot.max_speed_m_per_s * MEAN_PERIOD_S * steps + settings.cost.waypoint_radius_m
         self._state = 0.0, 0.0, 0.0, 0.0, 0.0
         self._moving = self.tracks.moving
         self._period_s = period_s
@@ -289,16 +287,19 @@ def _cost(
         if abs(omega_u) < robot.dead_band:
             omega_u = 0.0
         v_before, omega_before = v, omega
-        v, omega = next_velocities(v_u, omega_u, v, omega, PERIOD_S, robot.acceleration, robot.turn_acceleration)
-        turn = 0.5 * (omega_before + omega) * PERIOD_S
-        driven_m = 0.5 * (v_before + v) * PERIOD_S
+        v, omega = next_velocities(v_u, omega_u, v, omega, MEAN_PERIOD_S, robot.acceleration, robot.turn_acceleration)
+        turn = 0.5 * (omega_before + omega) * MEAN_PERIOD_S
+        driven_m = 0.5 * (v_before + v) * MEAN_PERIOD_S
         x_before, y_before, gap_before = x, y, gap
         x += driven_m * math.cos(yaw + 0.5 * turn)
         y += driven_m * math.sin(yaw + 0.5 * turn)
         yaw += turn
         gap = _value_at(field_m, x0, y0, cell_m, x, y) - robot.radius_m
         for disc_x, disc_y, disc_vx, disc_vy, radius, _ in moving:
-            away_x, away_y = x - disc_x - disc_vx * (t + 1) * PERIOD_S, y - disc_y - disc_vy * (t + 1) * PERIOD_S
+            away_x, away_y = (
+                x - disc_x - disc_vx * (t + 1) * MEAN_PERIOD_S,
+                y - disc_y - disc_vy * (t + 1) * MEAN_PERIOD_S,
+            )
             gap = min(gap, math.hypot(away_x, away_y) - radius - robot.radius_m)
         if gap < 0.0 and gap < gap_before:
             # Contact stops the robot, as it does in the world.
@@ -306,7 +307,7 @@ def _cost(
             cost += weights.collision_m
         if gap < weights.margin_m:
             near = min(1.0, 1.0 - gap / weights.margin_m)
-            cost += weights.near_m_per_s * near * near * PERIOD_S
+            cost += weights.near_m_per_s * near * near * MEAN_PERIOD_S
         if driven_m < 0.0:
             cost -= weights.reverse * driven_m
         before_m, left_m = left_m, _value_at(way, x0, y0, way_cell_m, x, y)
@@ -318,7 +319,7 @@ def _cost(
         straight_m = math.hypot(target_x - x, target_y - y)
         if last_leg and straight_m < weights.goal_radius_m:
             # Whatever the next goal is, the time that is left gains as much as full speed does.
-            saved_s = PERIOD_S * (steps - 1 - t)
+            saved_s = MEAN_PERIOD_S * (steps - 1 - t)
             braking_m = 0.5 * v * abs(v) / robot.acceleration
             stop_x, stop_y = x + braking_m * math.cos(yaw), y + braking_m * math.sin(yaw)
             if _value_at(field_m, x0, y0, cell_m, stop_x, stop_y) < robot.radius_m:

@@ -8,14 +8,13 @@ import gymnasium
 import numpy as np
 
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.limits import MEAN_PERIOD_S
 from rcdsac_trl.world.maps.generator import Split
 from rcdsac_trl.world.render import Renderer
 from rcdsac_trl.world.sim.bullet import OfOneProcess
 from rcdsac_trl.world.task.agent_group import AgentGroup
 from rcdsac_trl.world.task.spaces import ACTION_SIZE, SPACES
 from rcdsac_trl.world.task.world_settings import WorldSettings
-
-FRAMES_PER_S = 7  # a control period is 0.14 s on average
 
 
 class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
@@ -50,7 +49,10 @@ class NavigationGymEnv(OfOneProcess, gymnasium.Env[dict[str, np.ndarray], np.nda
         (180,)
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_S}  # noqa: RUF012 (as Gymnasium has it)
+    metadata = {  # noqa: RUF012 (as Gymnasium has it)
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1.0 / MEAN_PERIOD_S),
+    }
 
     def __init__(
         self,
