@@ -119,10 +119,40 @@ def test_preset_paper_is_the_papers_table_of_hyper_parameters() -> None:
     assert learner.actor_average_decay == 0.0
 
 
-@pytest.mark.parametrize("preset", choices("preset"))
+def test_preset_paper_takes_nothing_that_came_beyond_the_paper() -> None:
+    cfg = compose("train", ["+algo=rcdsac_pow", "preset=paper"])
+    expected = {
+        "learner.kappa": 1.0,
+        "learner.n_steps": 1,
+        "learner.mirror": False,
+        "learner.num_risk_samples": 16,
+        "learner.alpha_init": 0.05,  # which the paper does not give
+        "network.conv": 32,
+        "network.range": 128,
+        "network.vector": 32,
+        "network.memory": 128,
+        "network.head": 128,
+        "network.cosines": 64,
+        "network.range_code": "paper",
+        "network.restart_steps": None,
+        "network.look_ahead": False,
+        "acting.num_candidates": 1,
+        "sensor.memory_s": 0.0,
+    }
+    assert {key: OmegaConf.select(cfg, key) for key in expected} == expected
+
+
+def test_preset_paper_is_the_root() -> None:
+    cfg = compose("train", ["+algo=rcdsac_pow", "preset=paper"])
+    root = {key: value for key, value in yaml_of("train.yaml").items() if key not in ("defaults", "hydra")}
+    for key, value in leaves(root):
+        assert OmegaConf.select(cfg, key) == value, key
+
+
+@pytest.mark.parametrize("preset", [name for name in choices("preset") if name != "paper"])
 def test_every_value_of_a_preset_takes_effect(preset: str) -> None:
     """The defaults list must name `_self_` first, else the root overrides its presets in silence."""
-    values = yaml_of(f"preset/{preset}.yaml") or {}
+    values = yaml_of(f"preset/{preset}.yaml")
     cfg = compose("train", ["+algo=rcdsac_pow", f"preset={preset}"])
     for key, value in leaves(values):
         assert OmegaConf.select(cfg, key) == value, key

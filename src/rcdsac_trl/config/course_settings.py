@@ -6,7 +6,7 @@ from typing import Literal
 from rcdsac_trl.config.acting_override import ActingOverride
 from rcdsac_trl.config.navigation_settings import CourseNavigationSettings
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.system.checks import check_least
+from rcdsac_trl.system.checks import check_least, within
 from rcdsac_trl.system.processes import resolve_processes
 from rcdsac_trl.world.office.depth_cameras import Lens
 
@@ -47,14 +47,9 @@ class OdometrySettings:
 
     def __post_init__(self) -> None:
         """Refuse what would leave the robot lost."""
-        for name in ("scale_std", "travel_noise", "turn_noise"):
-            if not 0.0 <= getattr(self, name) <= 0.2:
-                raise UserInputError(f"odometry.{name}={getattr(self, name):g} must be from 0 to 0.2")
-        if not 0.1 <= self.fix_period_s <= 60.0:
-            raise UserInputError(f"odometry.fix_period_s={self.fix_period_s:g} must be from 0.1 to 60 seconds")
-        for name in ("fix_std_m", "fix_std_rad"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise UserInputError(f"odometry.{name}={getattr(self, name):g} must be from 0 to 1")
+        within("odometry", self, 0.0, 0.2, "scale_std travel_noise turn_noise")
+        within("odometry", self, 0.1, 60.0, "fix_period_s")
+        within("odometry", self, 0.0, 1.0, "fix_std_m fix_std_rad")
         if not 0.0 < self.fix_weight <= 1.0:
             raise UserInputError(f"odometry.fix_weight={self.fix_weight:g} must be above 0 and at most 1")
         if not all(0.0 <= std <= 0.5 for std in self.velocity_std):

@@ -94,7 +94,7 @@ class TeamSettings:
 
 
 @dataclass(frozen=True)
-class ReplaySettings:
+class ReplayBufferSettings:
     """The replay's size."""
 
     capacity_steps: int
@@ -145,7 +145,7 @@ class TrainingSettings:
     world: TeamSettings
     network: NetworkSettings
     learner: LearnerSettings
-    replay: ReplaySettings
+    replay: ReplayBufferSettings
     schedule: Schedule
     validation: ValidationSettings
     checkpoint: CheckpointSettings

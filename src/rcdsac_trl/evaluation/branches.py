@@ -20,13 +20,13 @@ from rcdsac_trl.agent.loss.functional import call_module, squash
 from rcdsac_trl.rollout.evaluation_pool import Rows
 from rcdsac_trl.system.interrupts import interruption_point
 
-NUM_FRACTIONS = 100
+NUM_READ_QUANTILES = 100
 """Quantiles that are read of every prediction."""
 
 
 def fractions() -> Tensor:
     """Return the fractions ``[100]`` at which predictions are read: the middles of 100 equal parts of [0, 1]."""
-    return (torch.arange(NUM_FRACTIONS, dtype=torch.float32) + 0.5) / NUM_FRACTIONS
+    return (torch.arange(NUM_READ_QUANTILES, dtype=torch.float32) + 0.5) / NUM_READ_QUANTILES
 
 
 @dataclass(frozen=True)

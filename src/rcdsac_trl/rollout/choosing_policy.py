@@ -11,7 +11,7 @@ from rcdsac_trl.agent.kernels import dispatch
 from rcdsac_trl.agent.kernels.compiled_values import CompiledValues
 from rcdsac_trl.agent.loss.distributional_sac import OVER_CRITICS
 from rcdsac_trl.agent.risk import RiskMeasure
-from rcdsac_trl.deploy.policy.acting import NUM_FRACTIONS, ActingSettings
+from rcdsac_trl.deploy.policy.acting import NUM_CHOICE_FRACTIONS, ActingSettings
 from rcdsac_trl.deploy.policy.distortion import fractions_of
 from rcdsac_trl.robot.look_ahead import nearer
 
@@ -50,7 +50,7 @@ class ChoosingPolicy(TensorDictModuleBase):
         self.policy = policy
         self._critics = critics
         self._steps = [dispatch.one_by_one(critic[0].module) for critic in critics]
-        tau = torch.from_numpy(fractions_of(NUM_FRACTIONS))
+        tau = torch.from_numpy(fractions_of(NUM_CHOICE_FRACTIONS))
         self._values = [_values_by(critic[1], tau, measure) for critic in critics]
         self._noise = torch.from_numpy(settings.noise())
         self._margin_m = settings.margin_m

@@ -1,5 +1,6 @@
 """Checks that settings share, each with its one sentence."""
 
+import math
 from typing import get_args
 
 from rcdsac_trl.errors import UserInputError
@@ -12,19 +13,27 @@ def one_of(key: str, value: object, literal: object) -> None:
 
 
 def at_least(section: str, settings: object, lowest: float, names: str) -> None:
-    """Refuse fields of a section, their names apart by spaces, that are no number of at least the lowest."""
+    """Refuse fields of a section, their names apart by spaces, that are no finite number of at least the lowest."""
     for name in names.split():
         value = getattr(settings, name)
-        if not isinstance(value, int | float) or not value >= lowest:
-            raise UserInputError(f"{section}.{name}={value} is not a number of at least {lowest:g}: raise it")
+        if not isinstance(value, int | float) or not lowest <= value < math.inf:
+            raise UserInputError(f"{section}.{name}={value} is not a number of at least {lowest:g}: give one")
 
 
 def positive(section: str, settings: object, names: str) -> None:
-    """Refuse fields of a section, their names apart by spaces, that are no positive number."""
+    """Refuse fields of a section, their names apart by spaces, that are no finite positive number."""
     for name in names.split():
         value = getattr(settings, name)
-        if not isinstance(value, int | float) or not value > 0:
+        if not isinstance(value, int | float) or not 0 < value < math.inf:
             raise UserInputError(f"{section}.{name}={value} is not a positive number: use one")
+
+
+def within(section: str, settings: object, lowest: float, highest: float, names: str) -> None:
+    """Refuse fields of a section, their names apart by spaces, that are no number from the lowest to the highest."""
+    for name in names.split():
+        value = getattr(settings, name)
+        if not isinstance(value, int | float) or not lowest <= value <= highest:
+            raise UserInputError(f"{section}.{name}={value} must be from {lowest:g} to {highest:g}")
 
 
 def check_least(key: str, value: int, lowest: int) -> None:

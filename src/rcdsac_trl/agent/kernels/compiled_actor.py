@@ -43,12 +43,15 @@ class Agents(NamedTuple):
     action: Floats
 
 
-class HeadWeights(NamedTuple):
-    """What :func:`_act` multiplies with behind the encoder: every matrix as [inputs, outputs]."""
+class ActorHeadWeights(NamedTuple):
+    """What :func:`_act` multiplies with behind the encoder: every matrix as [inputs, outputs].
+
+    What belongs to the gate is empty where there is none.
+    """
 
     input: Floats
     input_bias: Floats
-    frequencies: Floats  # of the gate's cosines; [0] without a gate
+    frequencies: Floats  # of the gate's cosines
     gate: Floats
     gate_bias: Floats
     hidden: Floats
@@ -58,7 +61,7 @@ class HeadWeights(NamedTuple):
 
 
 @_compiled
-def _act(agents: Agents, encoder: EncoderWeights, weights: HeadWeights) -> None:
+def _act(agents: Agents, encoder: EncoderWeights, weights: ActorHeadWeights) -> None:
     """Do a step of every agent."""
     ranges, vectors, embedded, states, noise, loc, scale, action = agents
     features = np.empty(encoder.linear_bias.size + encoder.vectors_bias.size, np.float32)
@@ -85,7 +88,7 @@ def _act(agents: Agents, encoder: EncoderWeights, weights: HeadWeights) -> None:
             action[agent, a] = min(max(drawn, -_LARGEST_ACTION), _LARGEST_ACTION)
 
 
-def _head_weights(head: Any) -> HeadWeights:
+def _head_weights(head: Any) -> ActorHeadWeights:
     """Lay out the weights of an actor's head."""
     gated = head.measure is not None
     none = head.input.bias.new_empty(0)
@@ -100,7 +103,7 @@ def _head_weights(head: Any) -> HeadWeights:
         "output": head.output.weight.t(),
         "output_bias": head.output.bias,
     }
-    return HeadWeights(**copied(tensors))
+    return ActorHeadWeights(**copied(tensors))
 
 
 class CompiledActor:
@@ -165,5 +168,5 @@ class CompiledActor:
         _act(Agents(*(value.numpy() for value in tensors)), *self._weights.current(bool(is_init.any())))
         return loc, scale, action, following
 
-    def _copied(self) -> tuple[EncoderWeights, HeadWeights]:
+    def _copied(self) -> tuple[EncoderWeights, ActorHeadWeights]:
         return encoder_weights(self._encoder), _head_weights(self._head)

@@ -22,8 +22,11 @@ from rcdsac_trl.system.jit import njit
 _compiled = njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 
 
-class HeadWeights(NamedTuple):
-    """What a critic's head multiplies with behind its gate: every matrix as [inputs, outputs]."""
+class CriticHeadWeights(NamedTuple):
+    """What a critic's head multiplies with behind its gate: every matrix as [inputs, outputs].
+
+    The gate is computed before, once for every beta.
+    """
 
     memory: Floats  # of the first layer: what the encoder hands on, [m, head]
     told: Floats  # of the first layer: what is told of an action, [2 or 4, head]
@@ -51,7 +54,12 @@ def _look_ahead(foreseen: Floats, slopes: Floats, offsets: Floats, told: Floats)
 
 @_compiled
 def _evaluate(
-    memories: Floats, actions: Floats, gates: Floats, hats: tuple[Floats, Floats], weights: HeadWeights, values: Floats
+    memories: Floats,
+    actions: Floats,
+    gates: Floats,
+    hats: tuple[Floats, Floats],
+    weights: CriticHeadWeights,
+    values: Floats,
 ) -> None:
     """Write the mean over the fractions of each agent's actions; see :meth:`CompiledValues.__call__`."""
     num_agents, num_actions, _ = actions.shape
@@ -109,7 +117,7 @@ class CompiledValues:
         self._head, self._tau, self._measure = head, tau, measure
         self._weights = WeightsOfNow([head], lambda: _head_weights(head))
         # What the gates were computed of, and these.
-        self._known: tuple[HeadWeights, Tensor, Floats] | None = None
+        self._known: tuple[CriticHeadWeights, Tensor, Floats] | None = None
 
     @torch.no_grad()
     def __call__(self, memory: Tensor, actions: Tensor, risk: Tensor, *, begins: bool) -> Tensor:
@@ -127,7 +135,7 @@ class CompiledValues:
         _evaluate(*rows, self._gates(weights, risk), (HAT_SLOPES, HAT_OFFSETS), weights, values.numpy())
         return values
 
-    def _gates(self, weights: HeadWeights, risk: Tensor) -> Floats:
+    def _gates(self, weights: CriticHeadWeights, risk: Tensor) -> Floats:
         """Return the gates of each agent, [N, F, head]; those of before where neither weights nor beta are new."""
         known = self._known
         if known is None or known[0] is not weights or not torch.equal(known[1], risk):
@@ -146,7 +154,7 @@ class CompiledValues:
         return gates
 
 
-def _head_weights(head: Any) -> HeadWeights:
+def _head_weights(head: Any) -> CriticHeadWeights:
     """Lay out the weights of a critic's head."""
     weight = head.input.weight.t()
     told = told_of_action(2, head.look_ahead is not None)
@@ -159,4 +167,4 @@ def _head_weights(head: Any) -> HeadWeights:
         "output": head.output.weight[0],
         "output_bias": head.output.bias,
     }
-    return HeadWeights(**copied(tensors))
+    return CriticHeadWeights(**copied(tensors))

@@ -12,7 +12,7 @@ from rcdsac_trl.system.checks import check_least, one_of
 OverCritics = Literal["minimum", "mean"]
 """What counts of what several critics say of an action."""
 
-NUM_FRACTIONS = 8
+NUM_CHOICE_FRACTIONS = 8
 """At so many fractions, each distorted, an action's return is read."""
 
 _MOST_CANDIDATES = 4096

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rcdsac_trl.deploy.policy.acting import NUM_FRACTIONS, ActingSettings
+from rcdsac_trl.deploy.policy.acting import NUM_CHOICE_FRACTIONS, ActingSettings
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.distortion import PSI, distorted, fractions_of
 from rcdsac_trl.deploy.policy.inference import Actor, Array, Critics
@@ -65,7 +65,7 @@ class ActionChoice:
             gate = None
             if self._config.critic == "quantile":
                 told = self._config.fixed_beta if beta is None else beta
-                fractions = distorted(self._config.measure, fractions_of(NUM_FRACTIONS), told or 0.0)
+                fractions = distorted(self._config.measure, fractions_of(NUM_CHOICE_FRACTIONS), told or 0.0)
                 gate = self._critics.gate(self._critics.of_fractions(fractions), embedded)
             self._gate = beta, gate
         return self._gate[1]

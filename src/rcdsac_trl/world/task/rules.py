@@ -8,7 +8,7 @@ in :mod:`rcdsac_trl.robot.action`.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import inside_dead_band
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
+from rcdsac_trl.system.checks import at_least, check_least, one_of, positive, within
 
 # Reward (paper, section "Reward").
 BASE_REWARD = -0.02
@@ -39,6 +40,9 @@ SURE_WAYPOINT_RADIUS_M = 0.15
 
 CollisionPenaltyMode = Literal["onset", "per_step"]
 """When r_coll is paid: once as a contact begins, or in every agent step in contact."""
+
+HowDisturbed = Literal["fixed", "drawn"]
+"""Noise, delay and slowness of an episode: what the settings say, or a drawn share of each."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ class TaskSettings:
     motor_slowness: float = 0.0
     stop_zone_share: float = 0.0
     stop_zone_margin_m: float = 0.05
-    disturbances: Literal["fixed", "drawn"] = "fixed"
+    disturbances: HowDisturbed = "fixed"
 
     def __post_init__(self) -> None:
         """Refuse what is outside the limits."""
@@ -107,25 +111,17 @@ class TaskSettings:
             raise UserInputError(
                 f"task.version={self.version!r} is not the version of the rules here: set it to {RULES_VERSION}"
             )
-        if self.episode_steps < 1:
-            raise UserInputError(f"task.episode_steps={self.episode_steps} must be at least 1")
-        modes = get_args(CollisionPenaltyMode)
-        if self.collision_penalty_mode not in modes:
-            raise UserInputError(
-                f"task.collision_penalty_mode={self.collision_penalty_mode!r} does not exist: "
-                f"choose {' or '.join(modes)}"
-            )
-        for name in ("waypoint_radius_m", "goal_radius_m", "min_path_m"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise UserInputError(f"task.{name}={getattr(self, name)} must be a positive number of metres")
+        check_least("task.episode_steps", self.episode_steps, 1)
+        check_least("task.action_delay_steps", self.action_delay_steps, 0)
+        one_of("task.collision_penalty_mode", self.collision_penalty_mode, CollisionPenaltyMode)
+        one_of("task.disturbances", self.disturbances, HowDisturbed)
+        positive("task", self, "waypoint_radius_m goal_radius_m min_path_m")
+        at_least("task", self, 0, "range_noise_std_m")
+        within("task", self, 0, 1, "range_dropout stop_zone_share stop_zone_margin_m")
         if not self.motor_steps or any(n != int(n) or n < 1 for n in self.motor_steps):
             raise UserInputError(
                 f"task.motor_steps={list(self.motor_steps)} must be whole numbers of at least 1, such as [6, 7, 8]"
             )
-        if not 0.0 <= self.range_noise_std_m < math.inf:
-            raise UserInputError(f"task.range_noise_std_m={self.range_noise_std_m} must be 0 or more")
-        if not 0.0 <= self.range_dropout <= 1.0:
-            raise UserInputError(f"task.range_dropout={self.range_dropout} is a probability; give 0 to 1")
         for name, units in (("odometry_noise_std", "m/s and rad/s"), ("pose_noise_std", "m and rad")):
             pair = getattr(self, name)
             if len(pair) != 2 or not all(0.0 <= s < math.inf for s in pair):
@@ -134,14 +130,6 @@ class TaskSettings:
             raise UserInputError(
                 f"task.motor_slowness={self.motor_slowness} is a share of the speed: give 0 to below 1"
             )
-        if not 0.0 <= self.stop_zone_share <= 1.0:
-            raise UserInputError(f"task.stop_zone_share={self.stop_zone_share} is a share of the episodes; give 0 to 1")
-        if not 0.0 <= self.stop_zone_margin_m <= 1.0:
-            raise UserInputError(f"task.stop_zone_margin_m={self.stop_zone_margin_m} must be 0 to 1 metres")
-        if self.disturbances not in ("fixed", "drawn"):
-            raise UserInputError(f"task.disturbances={self.disturbances!r} does not exist: choose fixed or drawn")
-        if self.action_delay_steps < 0:
-            raise UserInputError(f"task.action_delay_steps={self.action_delay_steps} must be 0 or more")
 
 
 REWARD_COMPONENTS = ("base", "goal", "waypoint", "angular", "collision")
