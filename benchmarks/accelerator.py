@@ -197,12 +197,13 @@ def graphed(learner: Any) -> Callable[[], Any]:
     """
     import torch
 
-    from rcdsac_trl.seeding import torch_stream
+    from rcdsac_trl.seeding import torch_seed
 
     for group in learner.optimizer.param_groups:
         group["capturable"] = True
     # A graph replays what the device draws, and nothing that comes from the CPU.
-    learner.loss._generator = torch_stream(0, "graph", device=next(learner.loss.parameters()).device)
+    device = next(learner.loss.parameters()).device
+    learner.loss._generator = torch.Generator(device).manual_seed(torch_seed(0, "graph"))
     static = prepared(learner).apply(held)
 
     def learn() -> None:

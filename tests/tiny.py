@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule
 
+from rcdsac_trl.config.checkpoint_name import CheckpointName
 from rcdsac_trl.config.compose import combinations, compose
 from rcdsac_trl.config.paths import CONF_DIR
 from rcdsac_trl.config.run_config import training_settings
@@ -23,7 +24,7 @@ from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.storage.checkpoint import Checkpoints
-from rcdsac_trl.storage.checkpoint_record import Progress
+from rcdsac_trl.storage.checkpoint_record import Progress, find
 from rcdsac_trl.training.run_folder import start_run_folder
 from rcdsac_trl.training.setup import check_training, make_trainer
 from rcdsac_trl.training.trainer import Trainer
@@ -96,6 +97,11 @@ def untrained_run(folder: Path, row: str, *overrides: str) -> tuple[Path, LossMo
     components = {"loss": loss, "average": average}
     Checkpoints(folder / "checkpoints", components, replay=None, keep=1).save(Progress(updates=7), {})
     return folder, loss, average
+
+
+def load_progress(checkpoints: Path, name: CheckpointName) -> Progress:
+    """Read how far a run was at a checkpoint."""
+    return find(checkpoints, name)[0].progress
 
 
 def evaluate(*overrides: str) -> Path:

@@ -42,8 +42,8 @@ def torch_seed(seed: int, purpose: str, *index: int) -> int:
     return int(seed_sequence(seed, purpose, *index).generate_state(1, np.uint64)[0] >> 1)
 
 
-def torch_stream(seed: int, purpose: str, *index: int, device: "torch.device | str" = "cpu") -> "torch.Generator":
-    """Return a torch generator for one purpose; see :func:`seed_sequence`."""
+def torch_stream(seed: int, purpose: str, *index: int) -> "torch.Generator":
+    """Return a torch generator on the CPU for one purpose; see :func:`seed_sequence`."""
     import torch  # late: maps, and with them the settings, need none
 
-    return torch.Generator(device=device).manual_seed(torch_seed(seed, purpose, *index))
+    return torch.Generator(device="cpu").manual_seed(torch_seed(seed, purpose, *index))

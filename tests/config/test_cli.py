@@ -25,9 +25,8 @@ from rcdsac_trl.config.typed import read
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.evaluation.measured_run import MeasuredRun
 from rcdsac_trl.report.card import measured_values
-from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.system.invocation import program
-from tiny import ROWS, TINY
+from tiny import ROWS, TINY, load_progress
 
 POW = "+algo=rcdsac_pow"
 ALL_ROWS = ", ".join(ROWS)

@@ -90,7 +90,7 @@ def test_a_command_lasts_015_s_on_average() -> None:
 def test_pursuit_that_knows_everything_reaches_the_end(direction: Direction) -> None:
     """Without people, on the shortest way that keeps 18 cm from everything, which is hardly longer than the course."""
     course = course_of(OFFICE, direction)
-    wide = Planner(OFFICE.map, margin_m=0.18)
+    wide = Planner(replace(OFFICE.map, clearance_margin_m=0.18))
     path = np.concatenate([course[:1], *(wide.true_path(start, end) for start, end in itertools.pairwise(course))])
     assert 53.7 < polyline_m(path) < 56.0
     pilot, steps, onsets, touched = PursuitPilot(), 0, 0, False

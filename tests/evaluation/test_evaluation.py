@@ -35,12 +35,12 @@ from rcdsac_trl.rollout.navigation_metrics import TRIP_METRICS
 from rcdsac_trl.rollout.policies import LeanPolicy, PursuitPolicy
 from rcdsac_trl.rollout.worker import EpisodeBatch, RolloutWorker
 from rcdsac_trl.storage.checkpoint import Checkpoints, load_weights
-from rcdsac_trl.storage.checkpoint_record import Progress, load_progress
+from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.training.validation import Snapshot
 from rcdsac_trl.world.maps.shapes import Kind
 from rcdsac_trl.world.task.env import make_env
 from rcdsac_trl.world.task.world_settings import WorldSettings
-from tiny import evaluate, evaluation_betas, exported, tiny_settings, tiny_trainer
+from tiny import evaluate, evaluation_betas, exported, load_progress, tiny_settings, tiny_trainer
 
 FILES = ("episodes.csv", "summary.csv", "collisions.csv", "evaluation.json")
 

@@ -15,7 +15,9 @@ from PIL import Image
 
 from rcdsac_trl.colors import LIGHT, mixed, rgb
 from rcdsac_trl.config.compose import compose
+from rcdsac_trl.deploy.policy.distortion import NUM_REPORTED_QUANTILES
 from rcdsac_trl.errors import FaultError, UserInputError
+from rcdsac_trl.evaluation import branches
 from rcdsac_trl.evaluation.branches import predict
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.evaluation.film import filming, video
@@ -229,7 +231,8 @@ def test_the_baseline_is_filmed_without_quantiles(tmp_path: Path, monkeypatch: p
     assert [(moment.beta, moment.quantiles) for moment in track.moments] == [(None, None)] * 3
 
 
-def test_predictions_are_those_of_critics_that_see_the_whole_episode() -> None:
+def test_predictions_are_those_of_critics_that_see_the_whole_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(branches, "NUM_READ_QUANTILES", NUM_REPORTED_QUANTILES)
     loss = make_loss(tiny_settings(), "cpu")
     generator = torch.Generator().manual_seed(0)
 
@@ -239,7 +242,7 @@ def test_predictions_are_those_of_critics_that_see_the_whole_episode() -> None:
     history = {"range": drawn(180), "waypoint": drawn(6), "velocity": drawn(4), "action": drawn(2)}
     betas = torch.tensor([-2.0, -1.0, -0.5])
     # Two episodes of three steps; rows 2 and 0 of three agents.
-    predictor = QuantilePredictor(loss.critics, [2, 0], num_quantiles=100)
+    predictor = QuantilePredictor(loss.critics, [2, 0])
     for step in range(6):
         now = {key: value[:, step] for key, value in history.items()}
         now |= {"risk": betas.unsqueeze(1), "is_init": torch.full((3, 1), step in (0, 3))}

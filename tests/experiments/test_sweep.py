@@ -20,9 +20,8 @@ from rcdsac_trl.experiments import sweep
 from rcdsac_trl.experiments.sweep import Job, State, runs_of
 from rcdsac_trl.experiments.sweep_jobs import check_single, make_sweep
 from rcdsac_trl.storage.atomic import FolderLock
-from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.system import subprocess_job
-from tiny import SMALL, Calls, first_combinations_only, yaml_of
+from tiny import SMALL, Calls, first_combinations_only, load_progress, yaml_of
 
 
 # ------------------------------------------------------------------------------------------------ which runs

@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
 from rcdsac_trl.storage.checkpoint import Checkpoints, Generators, load_weights
-from rcdsac_trl.storage.checkpoint_record import Progress, best_damage, find, folders, load_progress, newest
+from rcdsac_trl.storage.checkpoint_record import Progress, best_damage, find, folders, newest
 from rcdsac_trl.storage.replay_files import ReplayFiles
 from tiny import tiny_settings
 
@@ -62,7 +62,7 @@ def test_round_trip_restores_every_weight(tmp_path: Path, row: str) -> None:
     Checkpoints(tmp_path, {"loss": loss}, replay=None, keep=1).save(PROGRESS, {})
     assert not same(loss, other)
     assert load_weights(tmp_path, "best", loss=other) == []
-    assert load_progress(tmp_path, "best") == PROGRESS
+    assert find(tmp_path, "best")[0].progress == PROGRESS
     assert same(loss, other)
     assert other.log_alpha.item() == -0.75
 
@@ -355,7 +355,7 @@ def test_a_checkpoint_goes_by_its_iterations(tmp_path: Path) -> None:
 
 def test_a_missing_checkpoint_is_one_sentence(tmp_path: Path) -> None:
     told = f"there is no checkpoint in {tmp_path}: has this run saved one yet?"
-    for call in (lambda: load_progress(tmp_path, "best"), lambda: load_weights(tmp_path, "last", loss=make(0))):
+    for call in (lambda: find(tmp_path, "best"), lambda: load_weights(tmp_path, "last", loss=make(0))):
         with pytest.raises(UserInputError) as caught:
             call()
         assert str(caught.value) == told

@@ -12,13 +12,12 @@ from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings
 from rcdsac_trl.config.run_config import read_config, settings_of_new_run, settings_of_run
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.training.resume import differing_keys
 from rcdsac_trl.training.setup import make_trainer, resume_training
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings, read_building
 from rcdsac_trl.world.maps.files.map_files import digests
 from rcdsac_trl.world.maps.generator import MapSettings
-from tiny import SMALL, evaluate
+from tiny import SMALL, evaluate, load_progress
 
 # A map set's keys are not a file's.
 GIVEN = [override for override in SMALL if not override.startswith("map")]

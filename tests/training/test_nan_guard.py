@@ -11,12 +11,11 @@ from tensordict import TensorDict, TensorDictBase
 from rcdsac_trl import train
 from rcdsac_trl.errors import TrainingError
 from rcdsac_trl.rollout.make_agent import make_loss
-from rcdsac_trl.storage.checkpoint_record import load_progress
 from rcdsac_trl.training.learner import Learner
 from rcdsac_trl.training.nan_guard import load_failure, reproduce_failure
 from rcdsac_trl.training.setup import resume_training
 from rcdsac_trl.training.trainer import Trainer
-from tiny import ITERATIONS, TINY, tiny_settings, tiny_trainer
+from tiny import ITERATIONS, TINY, load_progress, tiny_settings, tiny_trainer
 
 
 def failing(trainer: Trainer) -> str:

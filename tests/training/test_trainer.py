@@ -23,7 +23,7 @@ from rcdsac_trl.rollout.episode_collectors import TorchRLEpisodeCollector
 from rcdsac_trl.rollout.make_agent import make_loss
 from rcdsac_trl.rollout.metrics import METRICS
 from rcdsac_trl.storage.checkpoint import load_weights
-from rcdsac_trl.storage.checkpoint_record import Progress, load_progress
+from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.training.learner import LOSS_KEYS, Learner
@@ -34,7 +34,18 @@ from rcdsac_trl.training.validation import Snapshot, Validation
 from rcdsac_trl.world.maps.shapes import Map
 from rcdsac_trl.world.task import episode
 from rcdsac_trl.world.task.env import NavigationEnv, make_env
-from tiny import AGENTS, ITERATIONS, ROWS, STEPS, UPDATES, evaluate, evaluation_betas, tiny_settings, tiny_trainer
+from tiny import (
+    AGENTS,
+    ITERATIONS,
+    ROWS,
+    STEPS,
+    UPDATES,
+    evaluate,
+    evaluation_betas,
+    load_progress,
+    tiny_settings,
+    tiny_trainer,
+)
 
 METRIC_COLUMNS = list(METRICS)
 

@@ -21,11 +21,11 @@ from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import named_agent
 from rcdsac_trl.storage.checkpoint import load_states
-from rcdsac_trl.storage.checkpoint_record import Saved, find, load_progress
+from rcdsac_trl.storage.checkpoint_record import Saved, find
 from rcdsac_trl.system.invocation import program
 from rcdsac_trl.training.setup import make_trainer, resume_training
 from rcdsac_trl.training.trainer import StopTraining, Trainer
-from tiny import TINY, agent_of_before
+from tiny import TINY, agent_of_before, load_progress
 
 CRITICS, TARGETS = "critic_network_params.", "target_critic_network_params."
 

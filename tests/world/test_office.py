@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_every_part_of_the_course_is_drivable_by_what_the_planner_knows() -> Non
 
 def test_a_robot_that_keeps_15_cm_from_everything_can_come_from_each_waypoint_to_the_next() -> None:
     # Wider than the robot by as much as it may be off its course and still need no luck.
-    free = Planner(OFFICE.map, ROBOT_RADIUS_M + 0.1, 0.05)._true
+    free = Planner(replace(OFFICE.map, clearance_margin_m=0.05), ROBOT_RADIUS_M + 0.1)._true
     labels, _ = label_components(free.free)
     for point in OFFICE.course:
         cell = free.nearest(point)

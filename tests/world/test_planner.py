@@ -449,10 +449,10 @@ def test_goals_that_cannot_be_are_refused() -> None:
 
 def test_a_margin_below_the_grid_is_refused() -> None:
     with pytest.raises(UserInputError, match=r"clearance_margin_m=0\.005 .* reaches 0\.25 m .*: raise it to 0\.01$"):
-        Planner(room(), margin_m=0.005)
+        Planner(replace(room(), clearance_margin_m=0.005))
     with pytest.raises(UserInputError, match=r"=0\.02 .* reaches 0\.05 m from its centre: raise it to 0\.037$"):
-        Planner(room(), robot_radius_m=0.05, margin_m=0.02)
-    Planner(room(), robot_radius_m=0.05, margin_m=0.037)
+        Planner(replace(room(), clearance_margin_m=0.02), robot_radius_m=0.05)
+    Planner(replace(room(), clearance_margin_m=0.037), robot_radius_m=0.05)
 
 
 def test_a_small_robot_that_needs_a_wider_margin_is_told_before_anything_is_driven() -> None:

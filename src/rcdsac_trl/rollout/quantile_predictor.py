@@ -18,22 +18,19 @@ class QuantilePredictor:
     Args:
         critics: an encoder and a quantile head each, from :func:`rcdsac_trl.agent.actor.build_critic`.
         rows: the agents.
-        num_quantiles: at how many fractions, the midpoints of equal parts of [0, 1].
 
     Attributes:
         rows: the agents, ``[R]``.
     """
 
-    def __init__(
-        self, critics: Sequence[TensorDictSequential], rows: Sequence[int], num_quantiles: int = NUM_REPORTED_QUANTILES
-    ) -> None:
+    def __init__(self, critics: Sequence[TensorDictSequential], rows: Sequence[int]) -> None:
         self.rows = torch.tensor(list(rows), device="cpu")
         self._critics = critics
-        self._tau = torch.from_numpy(fractions_of(num_quantiles)).expand(len(rows), 1, -1)
+        self._tau = torch.from_numpy(fractions_of(NUM_REPORTED_QUANTILES)).expand(len(rows), 1, -1)
         self._states = [self._tau.new_zeros(len(rows), critic[0].module.state_size) for critic in critics]
 
     def step(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the quantiles ``[R, N]`` of each agent's return from its action on.
+        """Return the quantiles ``[R, 16]`` of each agent's return from its action on.
 
         Args:
             tensordict: ``[N]``, the observations, `is_init`, `action`, and `risk` where the critics read it. Call it

@@ -132,15 +132,6 @@ def find(folder: Path, name: CheckpointName) -> tuple[Saved, list[str]]:
         raise UserInputError(f"{which} {path} is damaged: {error}; checkpoint=last is whole") from error
 
 
-def load_progress(folder: Path, name: CheckpointName) -> Progress:
-    """Read how far a run was at a checkpoint.
-
-    Raises:
-        UserInputError: as :func:`find`.
-    """
-    return find(folder, name)[0].progress
-
-
 def best_damage(folder: Path, progress: Progress) -> str | None:
     """Say what is wrong with the best checkpoint that some progress names; None if it is whole or there is none."""
     if progress.best_iterations is None:

@@ -154,18 +154,17 @@ class Planner:
         (2, True)
     """
 
-    def __init__(self, map: Map, robot_radius_m: float = ROBOT_RADIUS_M, margin_m: float | None = None) -> None:
+    def __init__(self, map: Map, robot_radius_m: float = ROBOT_RADIUS_M) -> None:
         """Lay the grids out; this takes a few milliseconds.
 
         Args:
-            map: the map.
+            map: the map, which says what is kept free beyond a radius.
             robot_radius_m: circumradius of the robot.
-            margin_m: what is kept free beyond a radius; the map's own margin when not given.
 
         Raises:
-            UserInputError: the margin is too small for the grid, or the map has no free place.
+            UserInputError: the map's margin is too small for the grid, or the map has no free place.
         """
-        margin_m = map.clearance_margin_m if margin_m is None else margin_m
+        margin_m = map.clearance_margin_m
         clearance_m = robot_radius_m + margin_m
         check_margin(margin_m, robot_radius_m)
         self.map = map
