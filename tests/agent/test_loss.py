@@ -630,6 +630,7 @@ def test_state_dict_continues_bit_for_bit() -> None:
         ({"alpha_init": 0.0}, "loss.alpha_init=0.0 is not a positive number"),
         ({"n_steps": 0}, "loss.n_steps=0 is not a number of at least 1"),
         ({"kappa": -1.0}, "loss.kappa=-1.0 is not a positive number"),
+        ({"kappa": math.inf}, "loss.kappa=inf is not a positive number"),
         ({"burn_in": -1}, "loss.burn_in=-1 is not a number of at least 0"),
         ({"fractions_per": "batch"}, "loss.fractions_per=batch is unknown: choose one of transition, sequence"),
         ({"fraction_sampling": "sobol"}, "choose one of uniform, stratified"),
