@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from rcdsac_trl.config.conditions import Condition, check_unique
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.rollout.metrics import METRICS, contact_onsets, episode_metrics, summarise
+from rcdsac_trl.rollout.metrics import METRICS, contact_onsets, episode_metrics, summarise, validation_score
 
 
 def flags(text: str) -> torch.Tensor:
@@ -92,6 +92,12 @@ def test_summary_by_hand_groups_missing_values_too() -> None:
     for metric in METRICS:
         assert summary[f"{metric}_mean"].tolist() == [2.5, 7.0]
         assert summary[f"{metric}_std"].tolist() == [1.5, 0.0]  # over the episodes measured: ddof 0
+
+
+def test_the_validation_score_charges_collisions_and_contact_by_hand() -> None:
+    means = pd.DataFrame({"reward": [100.0, 50.0], "collisions": [1.0, 0.5], "contact_fraction": [0.01, 0.0]})
+    # 100 - 10 * 1 - 1000 * 0.01 = 80 and 50 - 10 * 0.5 = 45, which count alike.
+    assert validation_score(means, episode_steps=1000) == pytest.approx(62.5)
 
 
 def test_conditions_name_themselves() -> None:
