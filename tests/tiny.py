@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
 from torch.optim.swa_utils import AveragedModel
 from torchrl.objectives import LossModule
 
@@ -22,12 +23,17 @@ from rcdsac_trl.deploy.policy.registry import find_weights
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.evaluation.evaluation import make_evaluation
 from rcdsac_trl.release.named_agent import named_agent
+from rcdsac_trl.robot.observation import vector_observations
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
+from rcdsac_trl.seeding import torch_stream
 from rcdsac_trl.storage.checkpoint import Checkpoints
 from rcdsac_trl.storage.checkpoint_record import Progress, find
+from rcdsac_trl.training.learner import Learner
+from rcdsac_trl.training.make_learner import make_learner
 from rcdsac_trl.training.run_folder import start_run_folder
 from rcdsac_trl.training.setup import check_training, make_trainer
 from rcdsac_trl.training.trainer import Trainer
+from rcdsac_trl.world.task.rules import REWARD_COMPONENTS
 
 ROWS = sorted(path.stem for path in (CONF_DIR / "algo").glob("*.yaml"))
 """Every row of the registry."""
@@ -55,7 +61,10 @@ TINY = [
     "logger=none",
 ]
 
-SMALL = [*TINY, "network={conv: 4, range: 8, vector: 4, memory: 8, head: 8, cosines: 4}", "schedule.iterations=1"]
+NARROW = "network={conv: 4, range: 8, vector: 4, memory: 8, head: 8, cosines: 4}"
+"""Networks of a few thousand weights."""
+
+SMALL = [*TINY, NARROW, "schedule.iterations=1"]
 """As small as a training gets."""
 
 Calls = list[tuple[str, str]]
@@ -82,6 +91,28 @@ def tiny_trainer(folder: Path, row: str = "rcdsac_pow", *overrides: str) -> Trai
     cfg = tiny_cfg(row, *overrides)
     check_training(cfg)
     return make_trainer(cfg, folder)
+
+
+def filled_learner(row: str, *overrides: str) -> Learner:
+    """Make the learner of a tiny training, its replay filled with episodes of noise."""
+    settings = tiny_settings(row, *overrides)
+    learner, algo = make_learner(settings, "cpu"), settings.algo
+    generator = torch_stream(0, "episodes of noise")
+
+    def uniform(size: int) -> torch.Tensor:
+        return torch.rand(ITERATIONS * AGENTS, STEPS, size, generator=generator)
+
+    def observations() -> dict[str, torch.Tensor]:
+        vectors = vector_observations(settings.sensor.memory_s)
+        return {"range": uniform(180)} | {key: uniform(size) for key, size in vectors.items()}
+
+    content: dict = observations() | {"action": 2.0 * uniform(2) - 1.0}
+    if algo.context_key is not None:
+        low, high = algo.collision_weight or (algo.distortion.low, algo.distortion.high)
+        content[algo.context_key] = low + (high - low) * uniform(1)[:, :1].expand(-1, STEPS, -1)
+    content["next"] = observations() | {"reward_components": -uniform(len(REWARD_COMPONENTS))}
+    learner.replay.add_episodes(TensorDict(content, batch_size=[ITERATIONS * AGENTS, STEPS]))
+    return learner
 
 
 def untrained_run(folder: Path, row: str, *overrides: str) -> tuple[Path, LossModule, AveragedModel]:
