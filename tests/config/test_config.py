@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, get_args, get_type_hints
@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from world_files import room, write_map_server
 
 from rcdsac_trl.config.algo_settings import AlgoSettings, DistortionSettings
+from rcdsac_trl.config.chosen_world import chosen_world
 from rcdsac_trl.config.compose import choices, compose
 from rcdsac_trl.config.conditions import Condition
 from rcdsac_trl.config.evaluation_settings import EvaluationSettings
@@ -24,7 +25,7 @@ from rcdsac_trl.rollout.make_agent import make_actor
 from rcdsac_trl.rollout.make_collector import make_episodes
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.world.task.world_settings import WorldSettings
-from tiny import ROWS, TINY, evaluate, tiny_settings, tiny_trainer, yaml_of
+from tiny import AGENTS, ROWS, TINY, evaluate, tiny_settings, tiny_trainer, yaml_of
 
 
 def composed(*overrides: str) -> TrainingSettings:
@@ -175,6 +176,14 @@ def test_every_choice_of_a_group_is_readable(group: str) -> None:
     for name in choices(group):
         if name != "barn":  # which no training takes
             composed("+algo=rcdsac_pow", f"{group}={name}", *more.get(name, []))
+
+
+# ------------------------------------------------------------------------------------------------ worlds
+def test_an_evaluation_that_changes_nothing_drives_where_its_agent_was_trained() -> None:
+    trained = tiny_settings("rcdsac_pow", "robot=turtlebot4", "sensor.memory_s=3", "task.range_noise_std_m=0.1")
+    chosen = chosen_world(trained, "an agent", maps=None, sensor=None, task=None, robot=None)
+    assert chosen.world_for(7) == trained.world_for(7)
+    assert trained.world_for(AGENTS) == replace(trained.training_world, num_workers=0, worker_timeout_s=None)
 
 
 # ------------------------------------------------------------------------------------------------ schedule
