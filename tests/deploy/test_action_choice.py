@@ -175,7 +175,7 @@ def test_a_margin_needs_heads_that_look_ahead() -> None:
     with pytest.raises(UserInputError, match=r"acting.margin_m=0.03 needs an agent with network.look_ahead=true"):
         Policy(agent(), acting=careful)
     assert Policy(agent(), acting=replace(careful, num_candidates=1)).acting.margin_m == 0.03  # not read
-    assert "told that all is 3 cm nearer" in str(careful)
+    assert str(careful).endswith("with a safety margin of 3 cm")
     assert "nearer" not in str(MANY)
 
 
