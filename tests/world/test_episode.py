@@ -305,6 +305,21 @@ def test_an_agent_that_was_never_reset_says_so() -> None:
     group.close()
 
 
+def test_rows_may_be_named_in_any_order_and_twice() -> None:
+    group = AgentGroup(
+        None, None, sensor="full", split="train", seed=0, agent_ids=(0, 1), first_episode=0, memory_s=0.0, gui=False
+    )
+    group.reset((0, 1), 0)
+    first, second = group.buffers.pose.copy()
+    assert not np.array_equal(first, second)
+    group.reset((1, 0), 0)
+    assert np.array_equal(group.buffers.pose, (first, second))
+    group.reset((0, 0))
+    assert [group.episode(row) for row in (0, 1)] == [1, 0]
+    assert np.array_equal(group.buffers.pose[1], second)
+    group.close()
+
+
 def agent_on_a_map() -> core.NavigationAgent:
     agent = core.NavigationAgent(MapSettings(), TaskSettings(), sensor_mask("full"), "evaluation", 0)
     agent.reset(0, 0)

@@ -117,8 +117,13 @@ class AgentGroup(OfOneProcess):
         self._next_episodes = [self._first_episode] * len(self)
 
     def reset(self, rows: Iterable[int], episode: int | None = None) -> None:
-        """Begin an episode of some agents: their next one, or the given one, from which they count on."""
-        begun = list(rows)
+        """Begin an episode of some agents: their next one, or the given one, from which they count on.
+
+        Args:
+            rows: which agents, in any order; one that is named twice begins one episode.
+            episode: its number; None: each agent's next one.
+        """
+        begun = sorted(set(rows))  # all of them are then written as the buffers lie
         for row in begun:
             number = self._next_episodes[row] if episode is None else _not_negative("episode", episode)
             self._agents[row].reset(self._seed, number)
