@@ -41,6 +41,17 @@ def test_a_single_key_of_a_family_can_be_changed() -> None:
     assert {changed: 1}[MapMixture(dict(changed.families))]
 
 
+def test_mixtures_that_give_other_maps_are_not_equal() -> None:
+    assert isinstance(VARIED, MapMixture)
+    turned = MapMixture(dict(reversed(VARIED.families.items())))
+    assert [VARIED.family_of("train", 0, index) for index in range(5)] != [
+        turned.family_of("train", 0, index) for index in range(5)
+    ]
+    assert turned != VARIED
+    assert MapMixture(dict(VARIED.families)) == VARIED
+    assert MapSettings() != VARIED
+
+
 def test_a_robot_must_fit_into_every_family() -> None:
     wide = replace(PAPER, name="wide", radius_m=0.3)
     with pytest.raises(UserInputError, match=r"robot=wide .* map\.door_width_m begins at 0\.75 m"):

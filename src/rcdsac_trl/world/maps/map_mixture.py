@@ -33,6 +33,12 @@ class MapMixture:
         if not self.families:
             raise UserInputError("map.families is empty: name a map set, such as mixed")
 
+    def __eq__(self, other: object) -> bool:
+        """Compare the sets in their order, which says what is on a map; dicts compare without it."""
+        if not isinstance(other, MapMixture):
+            return NotImplemented
+        return tuple(self.families.items()) == tuple(other.families.items())
+
     def __hash__(self) -> int:
         """Make it a key, as other sources of maps are: maps are kept by what they are made from."""
         return hash(tuple(self.families.items()))
