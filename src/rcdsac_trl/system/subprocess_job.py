@@ -60,19 +60,26 @@ def _watch(process: subprocess.Popen[bytes], should_stop: Callable[[], bool]) ->
         with suppress(subprocess.TimeoutExpired):
             return process.wait(timeout=_POLL_S)
         if should_stop():
-            process.terminate()
-            process.wait()
+            _terminate(process)
             return STOPPED
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     """Wait for a process that had the same Ctrl-C; end it if it did not stop by that, or had none."""
-    if ended_by() is not signal.SIGINT:  # what a supervisor sends goes to one process
-        process.terminate()
+    if ended_by() is signal.SIGINT:  # what a supervisor sends goes to this process alone
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=_PATIENCE_S)
+            return
+    _terminate(process)
+
+
+def _terminate(process: subprocess.Popen[bytes]) -> None:
+    """Ask a process to end, and end it if it does not: it may ignore the signal, or be stuck where it sees none."""
+    process.terminate()
     try:
         process.wait(timeout=_PATIENCE_S)
     except subprocess.TimeoutExpired:
-        process.terminate()
+        process.kill()
         process.wait()
 
 
