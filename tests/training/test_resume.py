@@ -429,6 +429,20 @@ def test_a_finished_run_says_so_and_changes_nothing(command: Any, short: Path, c
     assert files_of(short) == before
 
 
+def test_a_run_goes_on_only_where_its_logger_is_installed(
+    command: Any, refusal: Any, copied: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any
+) -> None:
+    config = OmegaConf.load(copied / "config.yaml")
+    config.logger.backends = ["wandb"]
+    OmegaConf.save(config, copied / "config.yaml")
+    monkeypatch.setitem(sys.modules, "wandb", None)  # as where it is missing
+    command([f"resume={copied}"])
+    assert capfd.readouterr().out.startswith(f"{copied} is finished: nothing is left to do\n")
+    told = "logger wandb is not installed: pip install 'rcdsac-trl[wandb]', or use logger=default"
+    assert refusal([f"resume={unfinished(copied)}"]) == told
+    FolderLock(copied).close()
+
+
 def noted_overrides(run: Path, overrides: list[str]) -> None:
     """Write down that a run was started with these, as the command line does."""
     manifest = run / "manifest.json"

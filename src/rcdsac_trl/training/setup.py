@@ -92,11 +92,11 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
     """Make the trainer that continues a run in its folder, as its config says; None if the run is finished.
 
     Raises:
-        UserInputError: if another process trains in it, or it has checkpoints and none is whole.
+        UserInputError: if another process trains in it, it has checkpoints and none is whole, or what an unfinished one
+            logs or collects with cannot be had.
     """
     settings = settings_of_run(folder, key="resume")
     resources.check_writable(folder)
-    settings.collector.check_package()
     check_maps(settings.map, settings.task.min_path_m, settings.robot.circumradius_m)
     check_processes(settings)
     lock = FolderLock(folder)
@@ -107,6 +107,8 @@ def resume_training(folder: Path, *, on_iteration_end: IterationHook | None = No
                 rotate(folder / CHECKPOINTS, keep=settings.checkpoint.keep, replay=folder / REPLAY)
             lock.close()
             return None
+        settings.logger.check_backends()
+        settings.collector.check_package()
         if saved is None:
             ended = ended_run(settings)
             check_memory(settings, inherited_steps(settings, ended))
