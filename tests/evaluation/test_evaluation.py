@@ -591,7 +591,9 @@ def test_building_an_evaluation_writes_nothing(run: Path, tmp_path: Path) -> Non
     assert not out.exists()
 
 
-def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def closed(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Note the workers of evaluations that are closed."""
     closed: list[bool] = []
     original: Callable[..., RolloutWorker] = driver.evaluation_worker
 
@@ -602,5 +604,20 @@ def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, monkeyp
         return worker
 
     monkeypatch.setattr(driver, "evaluation_worker", watched)
+    return closed
+
+
+def test_an_evaluation_closes_its_environment(run: Path, tmp_path: Path, closed: list[bool]) -> None:
     evaluate(f"run={run}", "beta=[-1]", f"out={tmp_path / 'out'}")
     assert closed == [True]
+
+
+def test_an_evaluation_whose_policy_cannot_be_made_leaves_neither_environment_nor_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: list[bool]
+) -> None:
+    monkeypatch.setattr(driver, "baseline_policy", lambda *_, **__: 1 / 0)
+    threads = torch.get_num_threads()
+    with pytest.raises(ZeroDivisionError):
+        evaluate("baseline=pursuit", f"threads={threads + 1}", f"out={tmp_path / 'out'}")
+    assert closed == [True]
+    assert torch.get_num_threads() == threads

@@ -23,7 +23,7 @@ from rcdsac_trl.rollout.environments import environment, evaluation_worker
 from rcdsac_trl.rollout.make_agent import make_loss, make_policy
 from rcdsac_trl.rollout.make_collector import make_episodes
 from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
-from rcdsac_trl.rollout.worker import EpisodeBatch, side_by_side
+from rcdsac_trl.rollout.worker import EpisodeBatch, RolloutWorker, side_by_side
 from rcdsac_trl.rollout.worker_processes import Drive, RolloutRequest, WorkerProcesses
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system import liveness
@@ -135,6 +135,18 @@ def test_episodes_do_not_depend_on_what_collects_them(row: str, monkeypatch: pyt
                 assert torch.equal(batch[key], expected[key]), (name, key)
     assert not torch.equal(first[0]["action"], first[1]["action"])
     assert not multiprocessing.active_children()
+
+
+def test_a_worker_whose_policy_cannot_be_made_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[RolloutWorker] = []
+    close = RolloutWorker.close
+    monkeypatch.setattr(RolloutWorker, "close", lambda self: (closed.append(self), close(self)))
+    monkeypatch.setattr("rcdsac_trl.rollout.make_collector.make_actor", lambda *_: 1 / 0)
+    settings = tiny_settings("sac", "collector.num_processes=0")
+    actor = make_loss(settings, "cpu").actor_network
+    with pytest.raises(ZeroDivisionError):
+        make_episodes(settings, actor, "cpu", Progress())
+    assert len(closed) == 1
 
 
 def test_episodes_that_end_early_are_the_beginning_of_whole_ones() -> None:

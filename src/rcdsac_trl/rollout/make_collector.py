@@ -101,25 +101,23 @@ def _worker(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Dr
         agent_ids=agent_ids,
         state_size=settings.network.state_size,
     )
-    actor = make_actor(settings)
-    policy = _collection_policy(settings, partial(make_policy, actor, device="cpu"), agent_ids)
+    with contextlib.closing(agents):
+        actor = make_actor(settings)
+        policy = _collection_policy(settings, partial(make_policy, actor, device="cpu"), agent_ids)
 
-    def drive(request: RolloutRequest, before_step: Callable[[], None]) -> EpisodeBatch:
-        actor.load_state_dict(safetensors.torch.load(request.weights))
-        policy.set_iteration(request.iteration)
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            return agents.rollout(
-                policy,
-                request.map_index,
-                observed=agents.env.agents.observations,
-                happened=HAPPENED,
-                before_step=before_step,
-            )
+        def drive(request: RolloutRequest, before_step: Callable[[], None]) -> EpisodeBatch:
+            actor.load_state_dict(safetensors.torch.load(request.weights))
+            policy.set_iteration(request.iteration)
+            with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+                return agents.rollout(
+                    policy,
+                    request.map_index,
+                    observed=agents.env.agents.observations,
+                    happened=HAPPENED,
+                    before_step=before_step,
+                )
 
-    try:
         yield drive
-    finally:
-        agents.close()
 
 
 def _by_torchrl(

@@ -114,63 +114,88 @@ def map_evaluator(
             their quantiles.
         wrap: puts something around the policy, which may change nothing of what it does.
     """
-    threads = torch.get_num_threads()
-    runtime.set_threads(spec.threads)
-    algo = None if actor is None else spec.trained.algo
+    with contextlib.ExitStack() as stack:
+        stack.callback(torch.set_num_threads, torch.get_num_threads())
+        runtime.set_threads(spec.threads)
+        worker = stack.enter_context(contextlib.closing(_worker(spec, told=actor is not None)))
+        noise = AgentNoise(_agent_ids(spec))
+        driver = _baseline(spec) if actor is None else _agent(spec, actor, loss, noise)
+        planner = driver if isinstance(driver, ControllerPolicy) else None
+        policy, timed, more = _wrapped(spec, driver, loss)
+        if wrap is not None:
+            policy = wrap(worker, policy)
+
+        def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
+            # By the map's number, so that it does not matter which process drives it.
+            noise.begin(spec.seed, "evaluation actions", map_index)
+            if planner is not None:
+                planner.set_map(map_index)
+            periods_s = _periods_s(spec, map_index).tolist()
+            for each in timed:
+                each.set_periods(periods_s)
+            return measure_map(
+                worker,
+                policy,
+                conditions=spec.conditions,
+                num_agents=spec.num_episodes,
+                map_index=map_index,
+                sampled=spec.sampled,
+                controlled=spec.controller is not None,
+                one_trip=spec.one_trip,
+                before_step=before_step,
+                more=partial(_all, more, map_index) if more else None,
+            )
+
+        yield partial(_with_collisions, spec, worker, drive) if spec.detailed else drive
+
+
+def _worker(spec: EvaluationSpec, *, told: bool) -> RolloutWorker:
+    """Make the agents of all conditions; a baseline's are told nothing."""
+    algo = spec.trained.algo if told else None
     state_size = spec.trained.network.state_size
-    worker = evaluation_worker(spec.world, algo, spec.conditions, spec.split, spec.seed, spec.num_episodes, state_size)
-    # An episode's noise is its own: the same under every condition, whichever they are and in whatever order.
-    agent_ids = [*range(spec.num_episodes)] * len(spec.conditions)
-    noise = AgentNoise(agent_ids)
-    if actor is None:
-        policy = baseline_policy(
-            spec.baseline, sensor=spec.world.sensor, agent_ids=agent_ids, seed=spec.seed, robot=spec.world.robot
-        )
-    else:
-        policy = _policy(spec, actor, noise)
-        if spec.acting.chooses:
-            policy = _choosing(spec, policy, loss)
-    planner = policy if isinstance(policy, ControllerPolicy) else None
+    return evaluation_worker(spec.world, algo, spec.conditions, spec.split, spec.seed, spec.num_episodes, state_size)
+
+
+def _agent_ids(spec: EvaluationSpec) -> list[int]:
+    """Number the episodes of every condition alike: what an episode draws is the same under each, in any order."""
+    return [*range(spec.num_episodes)] * len(spec.conditions)
+
+
+def _baseline(spec: EvaluationSpec) -> TensorDictModuleBase:
+    return baseline_policy(
+        spec.baseline, sensor=spec.world.sensor, agent_ids=_agent_ids(spec), seed=spec.seed, robot=spec.world.robot
+    )
+
+
+def _agent(spec: EvaluationSpec, actor: bytes, loss: bytes | None, noise: AgentNoise) -> TensorDictModuleBase:
+    """Make the policy of an agent, which acts by its mean or by its critics' choice."""
+    module = make_actor(spec.trained)
+    module.load_state_dict(safetensors.torch.load(actor))
+    policy = make_policy(module.to(spec.device), noise, spec.device)
+    return _choosing(spec, policy, loss) if spec.acting.chooses else policy
+
+
+def _wrapped(
+    spec: EvaluationSpec, policy: TensorDictModuleBase, loss: bytes | None
+) -> tuple[TensorDictModuleBase, list[Timed], list[Measure]]:
+    """Put around a policy what the evaluation asks for: foresight, navigators, controllers of beta.
+
+    Returns:
+        The policy, what is to be told how long its agents' steps take, and what measures more than every map is.
+    """
+    number = len(_agent_ids(spec))
+    timed: list[Timed] = [policy] if isinstance(policy, ControllerPolicy) else []
     more: list[Measure] = [partial(_trips, spec)] if spec.detailed else []
-    timed: list[Timed] = [] if planner is None else [planner]
     if spec.latency_s:
-        policy = _foresighted(spec, policy, len(agent_ids))
+        policy = _foresighted(spec, policy, number)
         timed.append(policy)
     if spec.navigation.is_on:
-        policy = _navigated(spec, policy, len(agent_ids))
+        policy = _navigated(spec, policy, number)
         timed.append(policy)
     if spec.controller is not None:
         policy = adaptive = _adaptive(spec, spec.controller, policy, loss)
         more.append(lambda *_: {"mean_beta": adaptive.mean_betas()})
-    if wrap is not None:
-        policy = wrap(worker, policy)
-
-    def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
-        # By the map's number, so that it does not matter which process drives it.
-        noise.begin(spec.seed, "evaluation actions", map_index)
-        if planner is not None:
-            planner.set_map(map_index)
-        periods_s = _periods_s(spec, map_index).tolist()
-        for each in timed:
-            each.set_periods(periods_s)
-        return measure_map(
-            worker,
-            policy,
-            conditions=spec.conditions,
-            num_agents=spec.num_episodes,
-            map_index=map_index,
-            sampled=spec.sampled,
-            controlled=spec.controller is not None,
-            one_trip=spec.one_trip,
-            before_step=before_step,
-            more=partial(_all, more, map_index) if more else None,
-        )
-
-    try:
-        yield partial(_with_collisions, spec, worker, drive) if spec.detailed else drive
-    finally:
-        worker.close()
-        torch.set_num_threads(threads)
+    return policy, timed, more
 
 
 def _choosing(spec: EvaluationSpec, policy: TensorDictModuleBase, loss: bytes | None) -> ChoosingPolicy:
@@ -273,9 +298,3 @@ def _periods_s(spec: EvaluationSpec, map_index: int) -> Tensor:
     return spec.world.robot.motor_period_s * torch.tensor(
         steps * len(spec.conditions), dtype=torch.float64, device="cpu"
     )
-
-
-def _policy(spec: EvaluationSpec, actor: bytes, noise: AgentNoise) -> TensorDictModuleBase:
-    module = make_actor(spec.trained)
-    module.load_state_dict(safetensors.torch.load(actor))
-    return make_policy(module.to(spec.device), noise, spec.device)
