@@ -467,6 +467,46 @@ def test_of_a_large_map_only_what_is_near_exists_and_nothing_else_changes(monkey
     assert len(set(few_bodies)) > 3  # they came and went
 
 
+def test_who_comes_back_to_a_part_of_a_large_map_meets_the_shapes_that_stood_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """PyBullet keeps the shapes of bodies that are gone: made anew at every return they would fill the memory."""
+    places = np.arange(2.0, 23.0, 2.0).tolist()
+    map_ = room(24.0, cylinders=[Cylinder(x, y, 0.4, mapped=True) for x in places for y in places])
+    planner = Planner(map_)
+    make = pybullet.createCollisionShapeArray
+    made: list[tuple] = []
+
+    def noted(**given):
+        made.append(tuple(given["collisionFramePositions"]))
+        return make(**given)
+
+    monkeypatch.setattr(pybullet, "createCollisionShapeArray", noted)
+
+    def driven(most_whole: int) -> tuple[list[tuple], int]:
+        monkeypatch.setattr(bodies, "MAX_WHOLE_SHAPES", most_whole)
+        made.clear()
+        simulation, contacts = Simulation(), 0
+        found: list[tuple] = []
+        simulation.load(map_, planner, (3.0, 3.0, 0.7), stream(0, "movers"))
+        for x in [21.0, 3.0] * 4:
+            simulation.place((x, 3.0, 0.7))
+            for _ in range(20):
+                result = simulation.step(0.6, 0.1, 7)
+                found.append((*result, *simulation.scan().tolist()))
+                contacts += result.in_contact
+        simulation.close()
+        return found, contacts
+
+    whole, contacts = driven(10_000)
+    groups = sorted(made)
+    near, _ = driven(10)
+    assert contacts > 50
+    assert near == whole
+    assert sorted(made) == sorted(set(made))
+    assert set(made) < set(groups)
+
+
 # What somebody does to the world while it runs
 
 

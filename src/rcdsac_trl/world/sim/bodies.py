@@ -61,6 +61,8 @@ class StaticBodies:
         firsts = range(0, len(shapes), SHAPES_PER_BODY)
         self._groups = [shapes[first : first + SHAPES_PER_BODY] for first in firsts]
         self._bodies: dict[int, int] = {}  # of the groups that exist
+        # Of the groups that ever did: PyBullet keeps a shape when its body goes, and a new one would be kept as well.
+        self._shapes: dict[int, int] = {}
         self._square: tuple[int, int] | None = None
         self._bounds = None if whole else np.array([_bounds(group) for group in self._groups])
         if whole:
@@ -88,9 +90,16 @@ class StaticBodies:
             self._add(number)
 
     def _add(self, number: int) -> None:
-        group = self._groups[number]
+        if number not in self._shapes:
+            self._shapes[number] = self._shape(self._groups[number])
+        self._bodies[number] = pybullet.createMultiBody(
+            0.0, self._shapes[number], self._visual, useMaximalCoordinates=1, physicsClientId=self._client
+        )
+
+    def _shape(self, group: list[Box | Cylinder]) -> int:
+        """Make the collision shape of a group; return its number."""
         boxes = [isinstance(shape, Box) for shape in group]
-        shape = pybullet.createCollisionShapeArray(
+        shape: int = pybullet.createCollisionShapeArray(
             shapeTypes=[pybullet.GEOM_BOX if box else pybullet.GEOM_CYLINDER for box in boxes],
             halfExtents=[
                 (s.half_x, s.half_y, _OBSTACLE_HALF_HEIGHT_M) if isinstance(s, Box) else (0.0, 0.0, 0.0) for s in group
@@ -103,9 +112,7 @@ class StaticBodies:
             ],
             physicsClientId=self._client,
         )
-        self._bodies[number] = pybullet.createMultiBody(
-            0.0, shape, self._visual, useMaximalCoordinates=1, physicsClientId=self._client
-        )
+        return shape
 
 
 def _bounds(shapes: list[Box | Cylinder]) -> list[float]:
