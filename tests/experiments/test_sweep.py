@@ -249,6 +249,29 @@ def test_a_run_that_someone_else_trains_is_left_alone(calls: Calls, tmp_path: Pa
     lock.close()
 
 
+def test_who_comes_second_where_two_found_a_folder_free_says_nothing_of_the_run(
+    calls: Calls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_sweep(["+algo=sac", *SMALL, "hydra.sweep.dir=all"])
+    call_here = sweep.call
+    locks: list[FolderLock] = []
+
+    def late(command: list[str], output: Path, *rest: Any) -> int:
+        """Begin to train when another launcher's training has just locked the folder."""
+        made.jobs[0].note(State("started"))
+        locks.append(FolderLock(output.parent))
+        return call_here(command, output, *rest)
+
+    monkeypatch.setattr(sweep, "call", late)
+    with pytest.raises(FaultError, match="is being trained in by another process"):
+        made.run()
+    for lock in locks:
+        lock.close()
+    assert calls == [("train", "sac-narrow-s0")]
+    assert "is being trained in by another process" in (made.jobs[0].folder / "console.log").read_text()
+    assert states(tmp_path / "all") == {"sac-narrow-s0": "started"}
+
+
 def test_a_folder_without_an_index_is_no_sweep(tmp_path: Path) -> None:
     with pytest.raises(UserInputError, match=r"holds no sweep.json: name a folder that a sweep wrote"):
         runs_of(tmp_path)

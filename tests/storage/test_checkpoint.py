@@ -204,7 +204,7 @@ def test_everything_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monke
     folder = three_checkpoints(run)
     for checkpoint in folders(folder):
         named = done.index(("rename", checkpoint))
-        temporary = checkpoint.with_name(f".unfinished-{checkpoint.name}")
+        temporary = checkpoint.with_name(f".unfinished-{os.getpid()}-{checkpoint.name}")
         inside = list(checkpoint.rglob("*"))
         assert len(inside) > 4
         for path in inside:
@@ -214,7 +214,8 @@ def test_everything_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monke
         # What a checkpoint names is there before it is.
         for segment in newest(folder)[0].segments[: int(checkpoint.name[-1])]:
             path = run / "replay" / segment.file
-            assert ("sync", path.with_name(f".unfinished-{path.name}")) in done[: done.index(("rename", path))]
+            written = path.with_name(f".unfinished-{os.getpid()}-{path.name}")
+            assert ("sync", written) in done[: done.index(("rename", path))]
             assert done.index(("rename", path)) < named
 
 

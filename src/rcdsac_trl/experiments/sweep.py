@@ -102,18 +102,28 @@ def execute(job: Job, cores: int | None = None, should_stop: Callable[[], bool] 
         should_stop: asked again and again while it trains; once it says so, the job is stopped.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        atomic.FolderLock(job.folder).close()
-    except UserInputError as error:  # whoever trains there says how it goes
-        return State("failed", str(error))
+    if (taken := _taken(job)) is not None:
+        return taken
     job.note(State("started"))
     try:
         state = _train_and_evaluate(job, {} if cores is None else {SHARE: str(cores)}, should_stop)
     except KeyboardInterrupt:
         job.note(State("interrupted"))
         raise
+    # Others may have found the folder free as well, and a training takes seconds to lock it: theirs was first.
+    if state.name == "failed" and (taken := _taken(job)) is not None:
+        return taken
     job.note(state)
     return state
+
+
+def _taken(job: Job) -> State | None:
+    """Say that somebody else trains in a job's folder, who says there how it goes; None if nobody does."""
+    try:
+        atomic.FolderLock(job.folder).close()
+    except UserInputError as error:
+        return State("failed", str(error))
+    return None
 
 
 def _train_and_evaluate(job: Job, variables: Mapping[str, str], should_stop: Callable[[], bool] | None) -> State:

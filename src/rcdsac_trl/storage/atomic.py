@@ -74,8 +74,8 @@ def reserve(folder: Path, size_bytes: int) -> None:
 
 
 def unfinished(path: Path) -> Path:
-    """Return the temporary name that a file or folder is written under."""
-    return path.with_name(_TEMPORARY + path.name)
+    """Return the temporary name that this process writes a file or folder under: others may write the same one."""
+    return path.with_name(f"{_TEMPORARY}{os.getpid()}-{path.name}")
 
 
 def publish(folder: Path) -> None:
@@ -97,9 +97,12 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(removed)
 
 
-def clear_leftovers(folder: Path) -> None:
-    """Remove what interrupted writers and removers left in a folder."""
-    for path in folder.glob(".*"):
+def clear_leftovers(folder: Path, of: str = "") -> None:
+    """Remove what interrupted writers and removers left in a folder, of everything or of one file.
+
+    Nobody may be writing that now.
+    """
+    for path in folder.glob(f".*{of}"):
         if path.is_dir():
             shutil.rmtree(path)
         else:

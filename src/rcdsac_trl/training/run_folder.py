@@ -37,6 +37,8 @@ def start_run_folder(folder: Path, cfg: DictConfig, facts: Mapping[str, object])
     """
     check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    for name in (MANIFEST_NAME, CONFIG_NAME):  # of a process that died as it began
+        atomic.clear_leftovers(folder, name)
     manifest = {
         "command": [Path(sys.argv[0]).stem, *sys.argv[1:]],
         "seed": cfg.seed,
