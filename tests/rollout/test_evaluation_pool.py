@@ -16,6 +16,8 @@ from endless_drive import endless
 
 from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.rollout.evaluation_pool import Drive, EvaluationPool, Rows, evaluate_maps
+from rcdsac_trl.system import process_pool
+from rcdsac_trl.system.process_pool import ProcessPool
 from rcdsac_trl.system.processes import WorkerError, resolve_processes, resolve_processes_beside
 from rcdsac_trl.training.machine_check import check_machine
 from rcdsac_trl.world.task.env import make_env
@@ -32,6 +34,18 @@ def breaking() -> Iterator[Drive]:
     def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
         os._exit(7)
 
+    yield drive
+
+
+@contextlib.contextmanager
+def refusing(when: str) -> Iterator[Drive]:
+    """Find that the input is wrong as the drive is made, or as it drives."""
+
+    def drive(map_index: int, before_step: Callable[[], None]) -> Rows:
+        raise UserInputError("there are no such maps: give others")
+
+    if when == "made":
+        drive(0, lambda: None)
     yield drive
 
 
@@ -68,6 +82,28 @@ def test_a_process_that_dies_ends_the_evaluation_and_leaves_none_behind() -> Non
     with pytest.raises(FaultError, match="exit code 7"):
         list(evaluate_maps(breaking, 4, processes=2))
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("when", ["made", "driving"])
+def test_wrong_input_that_a_process_finds_is_told_in_its_sentence_alone(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], when: str
+) -> None:
+    monkeypatch.setattr(process_pool, "START_METHOD", "fork")  # starts at once, and says what it says here
+    with pytest.raises(UserInputError, match=r"^there are no such maps: give others$"):
+        list(evaluate_maps(partial(refusing, when), 4, processes=2))
+    assert capfd.readouterr().err == ""
+    assert not multiprocessing.active_children()
+
+
+def test_whoever_asks_a_process_that_has_found_its_input_wrong_is_told_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process_pool, "START_METHOD", "fork")
+    pool = ProcessPool([partial(refusing, "made")], ["it"], module="rcdsac_trl.errors", timeout_s=None)
+    assert pool._connections[0].poll(None)  # it has said so
+    for _ in range(2):
+        pool.send(0, bytes(10_000_000))  # more than a pipe holds
+    with pytest.raises(UserInputError, match="no such maps"):
+        list(pool.answers(until_done=True))
+    pool.close()
 
 
 def test_processes_end_with_whoever_stops_asking() -> None:

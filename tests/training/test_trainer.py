@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.config.schedule import Schedule
-from rcdsac_trl.errors import TrainingError
+from rcdsac_trl.errors import TrainingError, UserInputError
 from rcdsac_trl.rollout.env_workers import EnvWorkers
 from rcdsac_trl.rollout.episode_collectors import TorchRLEpisodeCollector
 from rcdsac_trl.rollout.make_agent import make_loss
@@ -411,6 +411,18 @@ def test_a_hook_may_stop_a_run_and_its_error_ends_it(tmp_path: Path) -> None:
         stub_trainer(tmp_path, events, checkpoint_every=1, on_iteration_end=fail).run()
     sentence = "on_iteration_end failed in iteration 1 (ZeroDivisionError:); 0 iterations are saved, continue: "
     assert sentence in (tmp_path / "train.log").read_text()
+    assert events[-3:] == ["collector closed", "validation closed", "lock open"]
+
+
+def test_wrong_input_that_a_hook_finds_is_logged_once(tmp_path: Path) -> None:
+    def refuse(trainer: Trainer, record: Mapping[str, float]) -> None:
+        raise UserInputError("beta=9 is none")
+
+    events: list[Any] = []
+    told = f"beta=9 is none: training stops in iteration 1; 0 iterations are saved, {continuation(tmp_path)}"
+    with pytest.raises(UserInputError, match=f"^{re.escape(told)}$"):
+        stub_trainer(tmp_path, events, on_iteration_end=refuse).run()
+    assert [line for line in (tmp_path / "train.log").read_text().splitlines() if "beta=9" in line] == [told]
     assert events[-3:] == ["collector closed", "validation closed", "lock open"]
 
 

@@ -78,6 +78,7 @@ class EvaluationPool:
 
         Raises:
             WorkerError: if a process ends before its work does, or hangs.
+            UserInputError: if a process finds that its input is wrong.
         """
         for number, rows in self._pool.answers(until_done=until_done, watch=watch):
             self._give(number)
@@ -105,6 +106,7 @@ def evaluate_maps(
 
     Raises:
         FaultError: if a process ends before its work does; it has written why to stderr.
+        UserInputError: if what drives finds that its input is wrong, in whichever process.
     """
     if processes == 0:
         steps = itertools.count(1)

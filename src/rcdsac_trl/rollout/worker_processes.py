@@ -82,6 +82,7 @@ class WorkerProcesses:
 
         Raises:
             WorkerError: if a process dies or hangs.
+            UserInputError: if a process finds that its input is wrong.
         """
         for number in range(len(self.pool)):
             self.pool.send(number, request)

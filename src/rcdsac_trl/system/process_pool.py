@@ -10,13 +10,17 @@ from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from typing import Any, cast
 
+from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.system.interrupts import interruption_point
 from rcdsac_trl.system.liveness import Liveness
 from rcdsac_trl.system.processes import START_METHOD, WorkerError, check_may_start_processes, ending
 from rcdsac_trl.system.progress import Watch
 
 Serve = Callable[[Any, Callable[[], None]], Any]
-"""Answers a request; calls its second argument before every step, which shows that it does not hang."""
+"""Answers a request; calls its second argument before every step, which shows that it does not hang.
+
+A ``UserInputError`` of it, or as it is made, is an answer, too: it is raised where the answers are asked for.
+"""
 MakeServe = Callable[[], AbstractContextManager[Serve]]
 
 # Seconds between two looks at Ctrl-C and at processes that say nothing, while one waits for them.
@@ -108,6 +112,7 @@ class ProcessPool:
 
         Raises:
             WorkerError: if a process ends before its work does, or hangs.
+            UserInputError: if a process finds that its input is wrong.
         """
         if self._timeout_s is not None:  # nobody looked before
             self._liveness = {
@@ -123,6 +128,8 @@ class ProcessPool:
                 if connection in answered:
                     with self._reporting(number):
                         answer = connection.recv()
+                    if isinstance(answer, UserInputError):
+                        raise answer
                     self._open_requests[number] -= 1
                     if number in self._liveness:
                         self._liveness[number].renew(self._steps[number].value)
@@ -189,6 +196,14 @@ def _serve(connection: Connection, make: MakeServe, steps: Any) -> None:
         if not main.is_alive():
             raise SystemExit
 
-    with make() as serve, contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while connection in wait([connection, main.sentinel]):
-            connection.send(serve(connection.recv(), step))
+    nobody_asks = contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError)
+    try:
+        with make() as serve, nobody_asks:
+            while connection in wait([connection, main.sentinel]):
+                connection.send(serve(connection.recv(), step))
+    except UserInputError as error:
+        with nobody_asks:
+            connection.send(UserInputError(str(error)))
+            # Who still asks is to read that, not to find that this process is gone.
+            while connection in wait([connection, main.sentinel]):
+                connection.recv()

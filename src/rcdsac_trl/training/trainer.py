@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from rcdsac_trl.config.command_line import assigned
 from rcdsac_trl.config.schedule import Schedule
-from rcdsac_trl.errors import TrainingError
+from rcdsac_trl.errors import TrainingError, UserInputError
 from rcdsac_trl.rollout.episode_collectors import EpisodeCollector
 from rcdsac_trl.storage.atomic import FolderLock
 from rcdsac_trl.storage.checkpoint import Checkpoints
@@ -97,6 +97,7 @@ class Trainer:
 
         Raises:
             TrainingError: if a number is NaN or infinite, workers fail too often, or the disk or the memory fails.
+            UserInputError: if wrong input shows only now, such as maps without a way as long as the task asks for.
         """
         try:
             self._run()
@@ -110,18 +111,24 @@ class Trainer:
         except TrainingError as error:
             self.log.message(str(error))
             raise
+        except UserInputError as error:
+            raise UserInputError(self._stopped(str(error))) from error
         except Exception as error:
             if (sentence := fault_sentence(error)) is None:
                 raise
-            sentence = f"{sentence}: training stops {self._where()}; {self._saved_sentence()}"
-            with contextlib.suppress(OSError):  # the log may be on the same disk
-                self.log.message(sentence)
-            raise TrainingError(sentence) from error
+            raise TrainingError(self._stopped(sentence)) from error
         finally:
             self.episodes.close()
             self.validation.close()
             self.log.close()
             self.lock.close()
+
+    def _stopped(self, why: str) -> str:
+        """Log that the run ends here, why, and what is saved of it; return the sentence."""
+        sentence = f"{why}: training stops {self._where()}; {self._saved_sentence()}"
+        with contextlib.suppress(OSError):  # the log may be on a disk that failed
+            self.log.message(sentence)
+        return sentence
 
     def _run(self) -> None:
         total = self.schedule.iterations
@@ -150,7 +157,7 @@ class Trainer:
             return
         try:
             self.on_iteration_end(self, record)
-        except StopTraining:
+        except (StopTraining, UserInputError):
             raise
         except Exception as error:
             what = " ".join(f"{type(error).__name__}: {error}".split())
