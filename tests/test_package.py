@@ -83,7 +83,7 @@ def test_what_a_policy_is_in_a_line() -> None:
     )
     assert repr(rcdsac_trl.load("sac-narrow")) == (
         "Policy(sac, sensor narrow, remembers 12 s, robot paper, chooses among 32 actions, "
-        "an episode: collisions 0.77, reward 575)"
+        "an episode: collisions 0.25, reward 569)"
     )
     said = {name: repr(Policy(agent(**changes))) for name, changes in ROWS.items()}
     assert said["dsac_pow"] == "Policy(dsac_pow, sensor narrow, for beta=-1 alone, robot paper)"

@@ -168,7 +168,7 @@ def test_weights_carry_their_offsets_and_those_of_before_have_none(tmp_path: Pat
     assert read_weights(tmp_path).config == weights.config
     card = (tmp_path / "README.md").read_text()
     told = "recalibrated on 12 validation maps x 4 episodes (seed 3, beta = -2, 0)"
-    assert f"| tells | quantiles of the return, {told} |\n" in card
+    assert f"| reports | quantiles of the return, {told} |\n" in card
     assert "\n\n\n" not in card
     config = json.loads((tmp_path / "config.json").read_bytes())
     assert config["recalibration"] == json.loads(json.dumps(asdict(fitted())))

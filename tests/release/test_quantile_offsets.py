@@ -154,8 +154,8 @@ def test_the_card_says_what_is_told_and_what_was_earned(run: Path, published: Pa
         moved = entries[2 + number]["predicted"] - entries[number]["predicted"]
         assert moved == pytest.approx(np.mean(offsets[number]), abs=1e-3)
     card = (published / "README.md").read_text()
-    assert "| tells | quantiles of the return, recalibrated on 2 validation maps x 3 episodes (seed 0, beta" in card
-    assert "on 2 evaluation maps x 3 episodes (seed 0); raw is what its critics say" in card
+    assert "| reports | quantiles of the return, recalibrated on 2 validation maps x 3 episodes (seed 0, beta" in card
+    assert "on 2 evaluation maps x 3 episodes (seed 0); raw: as its critics predict" in card
     rows = [line for line in card.splitlines() if line.startswith(("| -2 |", "| -1 |"))]
     assert [line.split(" | ")[:2] for line in rows] == [
         ["| -2", "raw"],

@@ -65,7 +65,8 @@ def test_an_agent_is_told_in_a_simulation_what_it_is_told_on_a_robot() -> None:
         sectors = Sectors(np.where(NARROW, seen, np.inf), NARROW)
         v, omega = velocity[:2].tolist()
         elapsed_s = PERIOD_S if step else 0.0
-        bins, vectors = observer.observe(sectors, tuple(AHEAD), (v, omega), elapsed_s, PERIOD_S * step)
+        ahead = observer.ahead((v, omega), PERIOD_S * step)
+        bins, vectors = observer.observe(sectors, tuple(AHEAD), (v, omega), elapsed_s, ahead)
         told = inner.told[-1]
         np.testing.assert_array_equal(told["range"], bins)
         np.testing.assert_allclose(np.concatenate([told[key] for key in KEYS]), vectors, atol=2e-4)
