@@ -4,6 +4,7 @@ python docs/images/results_figures.py
 """
 
 import math
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
@@ -13,7 +14,7 @@ from matplotlib.figure import Figure
 from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.comparison_figures import paired_differences
 from rcdsac_trl.report.panels import include_zero
-from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.report.response_figures import beta_response
 from rcdsac_trl.report.style import style
 
@@ -94,8 +95,13 @@ def _trainings(name: str) -> list[Path]:
 
 def _means(run: Path, metric: str) -> pd.Series:
     """Return the mean of a metric at each beta; of who has none under NaN."""
-    episodes = read_episodes([run])
-    return episodes.table.groupby("beta", dropna=False)[metric].mean()
+    return _episodes(run).table.groupby("beta", dropna=False)[metric].mean()
+
+
+@cache
+def _episodes(run: Path) -> Episodes:
+    """Read what a run drove, once for all metrics."""
+    return read_episodes([run])
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple, TypeVar
 
-from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings
+from rcdsac_trl.config.training_settings import SensorSettings, TrainingSettings, world_of
 from rcdsac_trl.config.typed import read, section_class
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import RobotSettings
@@ -43,15 +43,7 @@ class ChosenWorld(NamedTuple):
         Raises:
             UserInputError: as :class:`~rcdsac_trl.world.task.world_settings.WorldSettings`.
         """
-        return WorldSettings(
-            map_settings=self.maps,
-            task=self.task,
-            sensor=self.sensor.name,
-            memory_s=self.sensor.memory_s,
-            num_agents=num_agents,
-            num_workers=0,
-            robot=self.robot,
-        )
+        return world_of(self.maps, self.task, self.sensor, self.robot, num_agents)
 
     def check_maps(self) -> None:
         """Refuse files that maps cannot be made from, before anything is driven; BARN's goals are given.

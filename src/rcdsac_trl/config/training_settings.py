@@ -129,6 +129,21 @@ class CheckpointSettings:
         check_least("checkpoint.keep", self.keep, 1)
 
 
+def world_of(
+    maps: MapSource, task: TaskSettings, sensor: SensorSettings, robot: RobotSettings, num_agents: int
+) -> WorldSettings:
+    """Return what so many agents drive in, side by side in one process."""
+    return WorldSettings(
+        map_settings=maps,
+        task=task,
+        sensor=sensor.name,
+        memory_s=sensor.memory_s,
+        num_agents=num_agents,
+        num_workers=0,
+        robot=robot,
+    )
+
+
 @dataclass(frozen=True)
 class TrainingSettings:
     """The root of ``conf/train.yaml``; every section is checked by its own class, here what spans several."""
@@ -222,15 +237,7 @@ class TrainingSettings:
 
     def world_for(self, num_agents: int) -> WorldSettings:
         """Return what so many agents drive in as in training, side by side in one process."""
-        return WorldSettings(
-            map_settings=self.map,
-            task=self.task,
-            sensor=self.sensor.name,
-            memory_s=self.sensor.memory_s,
-            num_agents=num_agents,
-            num_workers=0,
-            robot=self.robot,
-        )
+        return world_of(self.map, self.task, self.sensor, self.robot, num_agents)
 
     def replay_steps(self, inherited_steps: int = 0) -> int:
         """Return the steps that the replay is made for: no more than the run can fill.
