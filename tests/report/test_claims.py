@@ -16,8 +16,8 @@ from rcdsac_trl.report.course_claims import course_claims, judged_course_claims
 from rcdsac_trl.report.course_table import paper_course
 from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.read_course import read_courses
+from rcdsac_trl.report.rows import paper_table
 from rcdsac_trl.report.statistics import Array, Interval, Term, contrast
-from rcdsac_trl.report.table import paper_table
 from rcdsac_trl.report.verdict_words import as_table, evidence, missing, numbers, of_agents, over, tally
 from rcdsac_trl.report.verdicts import Cell, Claim, Finding, Group, Measured, Verdict, find, judge, than
 
@@ -196,6 +196,7 @@ def made_up(value: Callable[[pd.Series, str], Array], table: pd.DataFrame | None
                 **row[["agent", "beta", "collision_weight", "sensor"]].to_dict(),
                 "measure": None,
                 "helped": "",
+                "trained": True,
                 "beta_controller": None,
                 "train_seed": 0,
                 "map": np.repeat(np.arange(MAPS), EPISODES),

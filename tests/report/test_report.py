@@ -23,6 +23,7 @@ from rcdsac_trl.report.read import read_episodes
 from rcdsac_trl.report.read_course import read_courses
 from rcdsac_trl.report.response_figures import beta_response
 from rcdsac_trl.report.results import Results
+from rcdsac_trl.report.rows import paper_table
 from rcdsac_trl.report.write import write_report
 from rcdsac_trl.world.maps.shapes import Kind
 
@@ -83,7 +84,7 @@ def _few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
 
 # ------------------------------------------------------------------------------------------------ the paper's numbers
 def test_the_averages_of_the_papers_text_come_out_of_its_table() -> None:
-    found = table.averages(table.paper_table()).set_index(["name", "sensor"])
+    found = table.averages(paper_table()).set_index(["name", "sensor"])
 
     def average(name: str, sensor: str) -> tuple[float, float]:
         row = found.loc[(name, sensor)]
@@ -100,7 +101,7 @@ def test_the_averages_of_the_papers_text_come_out_of_its_table() -> None:
 
 
 def test_the_paper_has_twenty_four_rows_for_each_sensor() -> None:
-    paper = table.paper_table()
+    paper = paper_table()
     assert paper.groupby("sensor").size().to_dict() == {"narrow": 24, "sparse": 24}
     # What the paper says of its own table.
     narrow = paper[paper["sensor"] == "narrow"].set_index(["agent", "beta"])
@@ -411,7 +412,7 @@ def test_what_beta_does_is_said_in_words_on_axes_from_zero(tmp_path: Path, seeds
     ]
     figure = beta_response(read_episodes(folders), "cvar")
     assert figure is not None
-    over = " (dark), and training seeds, too (pale)" if seeds > 1 else ""
+    over = " (dark), and trainings, too (pale)" if seeds > 1 else ""
     assert figure.get_suptitle() == f"What β does, CVaR: averse at the left; 95 % intervals over maps{over}"
     reward = figure.axes[3]
     assert reward.get_legend() is not None

@@ -14,8 +14,8 @@ from rcdsac_trl.report import findings
 from rcdsac_trl.report.calibration_report import COVERED, Tell, calibration_of, driven_calibration_of
 from rcdsac_trl.report.collision_report import of_episodes
 from rcdsac_trl.report.read import read_episodes
+from rcdsac_trl.report.rows import row_label
 from rcdsac_trl.report.statistics import CONFIDENCE
-from rcdsac_trl.report.table import row_label
 
 _TOLD = (0.05, 0.5, 0.95)
 """Fractions whose coverage a card quotes of the quantiles that an agent tells."""

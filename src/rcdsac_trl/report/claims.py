@@ -11,8 +11,10 @@ from collections.abc import Iterator
 import pandas as pd
 
 from rcdsac_trl.report.read import Episodes
+from rcdsac_trl.report.rows import condition_label, paper_table
 from rcdsac_trl.report.statistics import Array
-from rcdsac_trl.report.table import SENSORS, averaged_settings, condition_label, paper_table
+from rcdsac_trl.report.table import SENSORS, averaged_settings
+from rcdsac_trl.report.training_errors import TrainingErrors
 from rcdsac_trl.report.verdicts import Cell, Claim, Expectation, Finding, Group, Measured, find, than
 
 _RESAMPLE, _STORED, _DSAC, _RCWR, _SAC = "RC-DSAC (resample)", "RC-DSAC (stored)", "DSAC", "RCWR", "SAC"
@@ -46,7 +48,7 @@ def _measured(episodes: Episodes) -> Measured:
     def printed(cell: Cell, metric: str) -> float:
         return float(paper[cell][f"{metric}_mean"]) if cell in paper else math.nan
 
-    return Measured(values, printed)
+    return Measured(values, printed, scatter=TrainingErrors(episodes).scatter)
 
 
 def _cell(row: pd.Series) -> Cell:

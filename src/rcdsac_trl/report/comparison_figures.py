@@ -12,11 +12,12 @@ from matplotlib.patches import Patch
 from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report import statistics
 from rcdsac_trl.report.collision_report import THINGS
-from rcdsac_trl.report.findings import labels, several_seeds
+from rcdsac_trl.report.findings import labels
 from rcdsac_trl.report.panels import PANEL
 from rcdsac_trl.report.read import METRIC_NAMES, Episodes
+from rcdsac_trl.report.rows import called, setting_label
 from rcdsac_trl.report.style import FAINT, INK, PAPER, style
-from rcdsac_trl.report.table import called, setting_label
+from rcdsac_trl.report.training_errors import TrainingErrors
 
 # What less of a metric is called, where it is counted.
 _LESS = {"collisions": "fewer", "goals": "fewer"}
@@ -49,11 +50,13 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     rng = np.random.default_rng(0)
+    errors = TrainingErrors(episodes)
     for row, i in enumerate(others):
         first, second = episodes.of(conditions.iloc[i], metric), episodes.of(base, metric)
         maps = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
-        same = conditions.iloc[i]["agent"] == base["agent"]
-        found = statistics.compare(first, second, same_agents=same).difference
+        same = errors.same(conditions.iloc[i], base)
+        error = errors.between(conditions.iloc[i], base, metric)
+        found = statistics.compare(first, second, same_agents=same, error=error).difference
         alone = statistics.compare(*map(statistics.of_these_agents, (first, second))).difference
         axes.scatter(maps, row + rng.uniform(-0.1, 0.1, len(maps)), s=9, color=FAINT, alpha=0.6, linewidths=0)
         axes.plot([found.low, found.high], [row, row], color=INK, linewidth=1.0, solid_capstyle="butt")
@@ -64,7 +67,7 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
     axes.axvline(0, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
     axes.set_yticks(range(len(others)), [_beside(conditions.iloc[i]) for i in others])
     _dress_rows(axes, len(others))
-    handles = _difference_legend(several_seeds(episodes, conditions.iloc[[reference, *others]]))
+    handles = _difference_legend(errors.scatter(base["sensor"], metric).is_known)
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 
@@ -76,15 +79,15 @@ def _beside(condition: pd.Series) -> str:
     return f"{name}\n{measure}{setting}" if measure else f"{name}{setting}"
 
 
-def _difference_legend(several_seeds: bool) -> list[Line2D]:
+def _difference_legend(over_trainings: bool) -> list[Line2D]:
     """Say what dots and lines of differences are."""
     interval = "mean, 95 % interval over maps"
     handles = [
         Line2D([], [], color=FAINT, marker="o", markersize=3, linestyle="", alpha=0.6, label="a map"),
         Line2D([], [], color=INK, marker="o", markersize=6, linewidth=3.0, label=interval),
     ]
-    if several_seeds:
-        handles.append(Line2D([], [], color=INK, linewidth=1.0, label="and over training seeds"))
+    if over_trainings:
+        handles.append(Line2D([], [], color=INK, linewidth=1.0, label="and over trainings"))
     return handles
 
 

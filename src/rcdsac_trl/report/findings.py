@@ -7,8 +7,10 @@ import pandas as pd
 
 from rcdsac_trl.report import statistics
 from rcdsac_trl.report.read import CONDITION, Episodes, possible
+from rcdsac_trl.report.rows import condition_label
 from rcdsac_trl.report.statistics import Array, Interval, Statistic
-from rcdsac_trl.report.table import condition_label
+from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_scatter import TrainingError
 
 TAILS = (0.1, 0.25)
 """Shares of the worst returns whose mean is given: realised CVaR."""
@@ -36,23 +38,21 @@ def labels(episodes: Episodes) -> list[str]:
     ]
 
 
-def several_seeds(episodes: Episodes, conditions: pd.DataFrame) -> bool:
-    """Return whether any of these conditions was driven by agents of several training seeds."""
-    return any(len(episodes.of(condition, "reward")) > 1 for _, condition in conditions.iterrows())
-
-
-def bounded(values: Array, metric: str, statistic: Statistic = statistics.mean) -> Interval:
+def bounded(
+    values: Array, metric: str, statistic: Statistic = statistics.mean, error: TrainingError | None = None
+) -> Interval:
     """Return a statistic of a metric and its interval, none of it outside of what the metric can be."""
-    return statistics.bootstrap(values, statistic).within(*possible(metric))
+    return statistics.bootstrap(values, statistic, error).within(*possible(metric))
 
 
 def summary(episodes: Episodes) -> pd.DataFrame:
     """Return `condition`, `statistic`, `value`, `low`, `high`: every metric's mean, and :data:`SUMMARISED`."""
-    rows = []
+    rows, errors = [], TrainingErrors(episodes)
     for (_, condition), label in zip(episodes.conditions.iterrows(), labels(episodes), strict=True):
         wanted = {metric: (metric, statistics.mean) for metric in episodes.metrics} | SUMMARISED
         for name, (metric, statistic) in wanted.items():
-            interval = bounded(episodes.of(condition, metric), metric, statistic)
+            error = errors.of(condition, metric, statistic)
+            interval = bounded(episodes.of(condition, metric), metric, statistic, error)
             rows.append({"condition": label, "statistic": name} | vars(interval))
     return pd.DataFrame(rows)
 
@@ -65,14 +65,15 @@ def comparisons(episodes: Episodes) -> pd.DataFrame:
         probability that an episode of the first is the better one, `better_low`, `better_high`; and `p_value`,
         adjusted by Holm's method for the number of pairs of its sensor, a metric at a time.
     """
-    rows = []
+    rows, errors = [], TrainingErrors(episodes)
     named = list(zip(episodes.conditions.iterrows(), labels(episodes), strict=True))
     for ((_, first), first_label), ((_, second), second_label) in itertools.combinations(named, 2):
         if first["sensor"] != second["sensor"]:
             continue
         for metric in COMPARED:
-            same = first["agent"] == second["agent"]
-            found = statistics.compare(episodes.of(first, metric), episodes.of(second, metric), same_agents=same)
+            sides = episodes.of(first, metric), episodes.of(second, metric)
+            same, error = errors.same(first, second), errors.between(first, second, metric)
+            found = statistics.compare(*sides, same_agents=same, error=error)
             better = found.improvement
             if metric in _BETTER_DOWN:
                 better = Interval(1 - better.value, 1 - better.high, 1 - better.low)
@@ -134,7 +135,7 @@ def adaptive(episodes: Episodes) -> pd.DataFrame:
         and `best_value`; `difference` from it, `low`, `high`; and `p_value`, adjusted by Holm's method for the agent's
         number of controllers.
     """
-    rows = []
+    rows, errors = [], TrainingErrors(episodes)
     for (agent, sensor), conditions in episodes.conditions.groupby(["agent", "sensor"], sort=False):
         turned = conditions[conditions["beta_controller"].notna()]
         fixed = [condition for _, condition in conditions.dropna(subset="beta").iterrows()]
@@ -144,7 +145,11 @@ def adaptive(episodes: Episodes) -> pd.DataFrame:
             for _, condition in turned.iterrows():
                 best = int(np.argmin(means) if metric in _BETTER_DOWN else np.argmax(means))
                 values = episodes.of(condition, metric)
-                compared = statistics.compare(values, episodes.of(fixed[best], metric), same_agents=True)
+                sides, error = (
+                    (values, episodes.of(fixed[best], metric)),
+                    errors.between(condition, fixed[best], metric),
+                )
+                compared = statistics.compare(*sides, same_agents=True, error=error)
                 found.append(
                     {
                         "agent": agent,

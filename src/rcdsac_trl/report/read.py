@@ -138,8 +138,8 @@ class Episodes:
 
     Attributes:
         table: one row an episode: :data:`CONDITION`, `mean_beta`, `train_seed`, `map`, `episode`, the metrics that
-            all have, `helped` as in :class:`Evaluation`, and `diagnosed`: whether its collisions are among
-            `collisions`.
+            all have, `helped` as in :class:`Evaluation`, `trained`: whether an agent drove, not a planner, and
+            `diagnosed`: whether its collisions are among `collisions`.
         protocol: of all evaluations.
         collisions: one row a collision, of the evaluations that wrote ``collisions.csv``, with :data:`CONDITION`.
     """
@@ -155,8 +155,8 @@ class Episodes:
 
     @cached_property
     def conditions(self) -> pd.DataFrame:
-        """One row a condition, with the agent's measure and `helped`, by evaluation, beta, and controller of it."""
-        rows = self.table[[*CONDITION, "measure", "helped"]].drop_duplicates()
+        """One row a condition, with its measure, `helped` and `trained`, by evaluation, beta, and controller of it."""
+        rows = self.table[[*CONDITION, "measure", "helped", "trained"]].drop_duplicates()
         agents = list(rows["agent"].unique())
         rows = rows.assign(order=rows["agent"].map(agents.index))
         by = ["sensor", "order", "beta", "collision_weight", "beta_controller"]
@@ -189,6 +189,8 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
             measure=evaluation.described.get("measure"),
             helped=evaluation.helped,
             train_seed=evaluation.described.get("train_seed") or 0,
+            # Evaluations of earlier versions that say nothing of it are of agents.
+            trained=evaluation.described.get("train_seed", 0) is not None,
             folder=str(evaluation.folder),
             diagnosed=evaluation.collisions is not None,
         )

@@ -10,12 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from rcdsac_trl.report import statistics
-from rcdsac_trl.report.findings import TAILS, bounded, several_seeds
+from rcdsac_trl.report.findings import TAILS, bounded
 from rcdsac_trl.report.panels import PANEL, Panels, include_zero, legend_of
 from rcdsac_trl.report.read import Episodes
+from rcdsac_trl.report.rows import condition_label, has_dial
 from rcdsac_trl.report.statistics import Interval, Statistic
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, PAPER, series, style
-from rcdsac_trl.report.table import condition_label, has_dial
+from rcdsac_trl.report.training_errors import TrainingErrors
 
 _TAIL = TAILS[0]
 # What follows beta, in four panels.
@@ -55,10 +56,11 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
     if not (groups := _driven_at_several(episodes, measure)):
         return None
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
-    seeds = any(several_seeds(episodes, rows) for _, rows in groups)
+    errors = TrainingErrors(episodes)
+    known = any(errors.scatter(rows.iloc[0]["sensor"], "reward").is_known for _, rows in groups)
     figure.suptitle(
         f"What β does, {_MEASURES.get(measure, measure)}: averse at the left; "
-        f"95 % intervals over maps{' (dark), and training seeds, too (pale)' if seeds else ''}",
+        f"95 % intervals over maps{' (dark), and trainings, too (pale)' if known else ''}",
         x=0.01,
         ha="left",
         fontsize=13,
@@ -106,11 +108,14 @@ def _driven_at_several(episodes: Episodes, measure: str) -> _Groups:
 
 def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str) -> None:
     metric, statistic = _RESPONSES[heading]
+    errors = TrainingErrors(episodes)
     for number, ((name, rows), color) in enumerate(zip(groups, series(len(groups)), strict=True)):
         values = [episodes.of(condition, metric) for _, condition in rows.iterrows()]
         marker = MARKERS[number % len(MARKERS)]
-        if any(len(v) > 1 for v in values):
-            _shade(axes, rows["beta"], [bounded(v, metric, statistic) for v in values], color, alpha=0.08)
+        if errors.scatter(rows.iloc[0]["sensor"], metric, statistic).is_known:
+            of_trainings = [errors.of(condition, metric, statistic) for _, condition in rows.iterrows()]
+            over_trainings = [bounded(v, metric, statistic, e) for v, e in zip(values, of_trainings, strict=True)]
+            _shade(axes, rows["beta"], over_trainings, color, alpha=0.08)
         alone = [bounded(statistics.of_these_agents(v), metric, statistic) for v in values]
         middle = [interval.value for interval in alone]
         if has_dial(rows.iloc[0]["agent"]):
@@ -122,7 +127,7 @@ def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str
         axes.plot(rows["beta"], middle, color=color, marker=marker, label=name, **dressed)
         if metric == "reward":
             axes.plot(rows["beta"], [statistics.mean(v) for v in values], color=color, **mean_dressed)
-        _draw_turned(axes, episodes, rows.iloc[0], metric, statistic, color)
+        _draw_turned(axes, episodes, errors, rows.iloc[0], metric, statistic, color)
     style(axes, heading, "β")
     axes.set_xticks(sorted({beta for _, rows in groups for beta in rows["beta"]}))
     include_zero(axes)
@@ -142,6 +147,7 @@ def _shade(axes: Axes, x: pd.Series, intervals: Sequence[Interval], color: str, 
 def _draw_turned(
     axes: Axes,
     episodes: Episodes,
+    errors: TrainingErrors,
     of: pd.Series,
     metric: str,
     statistic: Statistic,
@@ -152,7 +158,8 @@ def _draw_turned(
     same = (conditions["agent"] == of["agent"]) & (conditions["sensor"] == of["sensor"])
     for _, condition in conditions[same & conditions["beta_controller"].notna()].iterrows():
         beta = statistics.mean(episodes.of(condition, "mean_beta"))
-        found = bounded(episodes.of(condition, metric), metric, statistic)
+        error = errors.of(condition, metric, statistic)
+        found = bounded(episodes.of(condition, metric), metric, statistic, error)
         axes.plot([beta, beta], [found.low, found.high], color=color, linewidth=1.2)
         axes.plot(beta, found.value, marker="*", markersize=11, color=color, markeredgecolor=PAPER, linestyle="none")
         name = condition["beta_controller"].replace("_", " ")

@@ -13,6 +13,7 @@ from rcdsac_trl.report.learning_figures import learning_panels
 from rcdsac_trl.report.page import Card, Figures, Folded, Heading, Part, Section
 from rcdsac_trl.report.response_figures import beta_panels
 from rcdsac_trl.report.results import Results
+from rcdsac_trl.report.rows import condition_label
 from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, PERMUTATIONS
 from rcdsac_trl.report.verdict_words import evidence, missing, numbers, of_agents, over, tally
 from rcdsac_trl.report.verdicts import COMPARABLE, Finding, Verdict
@@ -20,8 +21,8 @@ from rcdsac_trl.report.verdicts import COMPARABLE, Finding, Verdict
 _VERDICTS = (
     f"A claim holds, or does not, where the {CONFIDENCE_TEXT} interval of the difference says so. Otherwise it cannot "
     "be told. Differences are paired: all agents met the same maps, starts and goals. Intervals are over maps, and "
-    "over training seeds where there are several. With one seed they speak of these agents alone: another training "
-    "may differ.",
+    "over trainings where some agent has several: how these differ is pooled over all agents, so that it counts for "
+    "those with one training, too. Where each has one, intervals speak of these agents alone: another may differ.",
     f"Differences below {100 * COMPARABLE:.0f} % of the mean count as none. A claim about many rows fails only where "
     "one of them fails beyond what one of so many does by chance. The paper's numbers stand in brackets. Its maps are "
     "not available: compare differences, not levels.",
@@ -146,7 +147,7 @@ def _paper(results: Results) -> list[Part]:
     lacking = [f"{sensor}: {', '.join(rows)}" for sensor, rows in table.missing_rows(results.episodes).items() if rows]
     parts: list[Part] = [
         f"Mean ± standard deviation over {maps * each} episodes a training seed, as in the paper, and the "
-        f"{CONFIDENCE_TEXT} interval of the mean over maps (and training seeds, where there are several).",
+        f"{CONFIDENCE_TEXT} interval of the mean over maps (and trainings, where some agent has several).",
         _rows_named(results.paper),
     ]
     if lacking:
@@ -224,7 +225,7 @@ def _course_column(name: str) -> tuple[str, str]:
 def _beta(results: Results) -> list[Part]:
     parts: list[Part] = [
         f"Averse at the left. Shaded: the {CONFIDENCE_TEXT} interval of these agents, if other maps of the same kind "
-        "had been drawn. Paler, where there are several training seeds: if they had been others, too."
+        "had been drawn. Paler, where some agent has several trainings: if these had been others, too."
     ]
     for measure in results.measures:
         if panels := beta_panels(results.episodes, measure):
@@ -244,7 +245,7 @@ def _beta(results: Results) -> list[Part]:
 def _trends(trends: pd.DataFrame) -> pd.DataFrame:
     sensors = trends["sensor"].nunique()
     agents = (
-        table.condition_label(agent, sensor, float("nan"), float("nan"), None, sensors)
+        condition_label(agent, sensor, float("nan"), float("nan"), None, sensors)
         for agent, sensor in zip(trends["agent"], trends["sensor"], strict=True)
     )
     names = {metric: heading(metric) for metric in findings.TRENDS} | {
@@ -300,12 +301,12 @@ def _pairs(results: Results) -> list[Part]:
     shown = pairs[pairs["first"].isin(references) | pairs["second"].isin(references)]
     return [
         f"A dot a map; a thick line is the {CONFIDENCE_TEXT} interval of these agents over other maps, a thin one over "
-        "other training seeds, too, where there are several.",
+        "other trainings, too, where some agent has several.",
         Figures(figures),
         "Probability: that an episode of the first is better than one of the second on the same map (fewer collisions, "
-        "more reward). p-values: sign permutations over maps, with the error of the training seeds where there are "
-        "several, adjusted by Holm's method for the number of pairs. With one training seed they speak of these "
-        "trained agents, not of the algorithms.",
+        "more reward). p-values: sign permutations over maps, with the error of the trainings where some agent has "
+        "several, adjusted by Holm's method for the number of pairs. Where each has one they speak of these trained "
+        "agents, not of the algorithms.",
         *_by_metric(shown, _compared),
         "All other pairs are in comparisons.csv.",
     ]
@@ -348,4 +349,4 @@ def _everything(results: Results) -> list[Part]:
     wide = cells.pivot(index="condition", columns="column", values="text")
     ordered = wide.loc[cells["condition"].drop_duplicates(), cells["column"].drop_duplicates()]
     shown = ordered.rename_axis(None, axis=1).reset_index().rename(columns={"condition": "agent"})
-    return [f"Mean [{CONFIDENCE_TEXT} interval over maps, and over training seeds where there are several].", shown]
+    return [f"Mean [{CONFIDENCE_TEXT} interval over maps, and over trainings where some agent has several].", shown]

@@ -4,8 +4,8 @@ many independent observations.
 Values come as arrays ``[S, M, E]``: training seeds, maps, episodes on a map. Seeds and maps are crossed, not nested:
 the agents of all seeds met the same maps. So a resample draws its maps once, for all seeds. The seeds themselves are
 few, and resampling few values gives intervals that are too narrow (95 % intervals of two seeds hold the truth half of
-the time): what seeds add to an error is taken from Student's t distribution. Where several trainings add to it, its
-degrees of freedom are those of Welch and Satterthwaite: two seeds of each of five agents know more than two of one.
+the time): what seeds add to an error is taken from Student's t distribution, with a scatter that is pooled over all
+agents there are (:mod:`rcdsac_trl.report.training_scatter`).
 """
 
 from collections import defaultdict
@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from rcdsac_trl.report.training_scatter import Array, TrainingError, TrainingScatter
+
 Statistic = Callable[[Array], float]
 
 CONFIDENCE = 0.95
@@ -147,17 +148,17 @@ def cvar(share: float) -> Statistic:
     return lambda values: float(lower_mean(values.reshape(1, -1), share)[0])
 
 
-def bootstrap(values: Array, statistic: Statistic = mean) -> Interval:
+def bootstrap(values: Array, statistic: Statistic = mean, error: TrainingError | None = None) -> Interval:
     """Return a statistic of all episodes and its confidence interval.
 
-    Resamples draw maps, the same ones for all training seeds; the episodes of a map stay together. Where there are
-    several seeds, each resample also gets an :func:`error of the seeds <_errors_of_seeds>`, from how far the statistic
-    of one seed lies from another's: the interval then speaks of the recipe, else of the one agent. Its bounds are
-    percentiles of the resamples.
+    Resamples draw maps, the same ones for all training seeds; the episodes of a map stay together. Each also gets an
+    error that other trainings would bring: with one the interval speaks of the recipe, else of the one agent. Its
+    bounds are percentiles of the resamples.
 
     Args:
         values: ``[S, M, E]``.
         statistic: of an array of any shape.
+        error: of the statistic; None: what these seeds say of it, and one seed says nothing.
     """
     chosen, _ = _resamples(values.shape[1], DRAWS, PERMUTATIONS)
     if statistic is mean:  # of all draws at once, from the sums of maps
@@ -166,9 +167,11 @@ def bootstrap(values: Array, statistic: Statistic = mean) -> Interval:
         drawn = np.divide(sums[chosen].sum(1), totals, out=np.full(DRAWS, np.nan), where=totals > 0)
     else:
         drawn = np.array([statistic(values[:, maps]) for maps in chosen])
-    of_seeds = np.array([statistic(values[seed]) for seed in range(len(values))])
     value = statistic(values)
-    return _interval(value, _widened(drawn, value, values.shape[1]) + _errors_of_seeds(DRAWS, of_seeds))
+    if error is None:
+        of_seeds = np.array([[statistic(of_seed)] for of_seed in values])
+        error = _own_error([([1.0], of_seeds)])
+    return _interval(value, _widened(drawn, value, values.shape[1]) + error.draw(DRAWS))
 
 
 def bootstrap_maps(values: Array, statistic: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
@@ -190,30 +193,34 @@ def bootstrap_maps(values: Array, statistic: Callable[[Array], Array]) -> tuple[
     return statistic(values), low, high
 
 
-def compare(first: Array, second: Array, *, same_agents: bool = False) -> Comparison:
+def compare(
+    first: Array, second: Array, *, same_agents: bool = False, error: TrainingError | None = None
+) -> Comparison:
     """Compare two sets of episodes on the same maps.
 
     Intervals resample maps, for both sides and all seeds at once. The test permutes, map by map, which side is which
     (the mean of a map over seeds and episodes is one observation): exact, and without an assumption about the
-    distribution. A side with several training seeds adds an :func:`error of the seeds <_errors_of_seeds>` to every
-    resample and permutation. Of two settings of the same agents the errors are those of the differences seed by seed:
-    what the settings have in common cancels.
+    distribution. Every resample and permutation also gets an error that other trainings would bring. Of two settings
+    of the same agents what they have in common cancels.
 
     Args:
         first: ``[S, M, E]``.
         second: ``[S', M, E]``, the same maps, starts and goals.
         same_agents: whether both sides were driven by the same agents, in one order; else they are independent.
+        error: of the difference; None: what these seeds say of it. That of the improvement is always theirs.
     """
     differences = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
     maps = len(differences)
     chosen, signs = _resamples(maps, DRAWS, PERMUTATIONS)
-    of_seeds = _of_trainings(np.nanmean(first, axis=(1, 2)), -np.nanmean(second, axis=(1, 2)), same_agents)
-    drawn = _widened(differences[chosen].mean(1), differences.mean(), maps) + _errors_of_seeds(DRAWS, *of_seeds)
-    permuted = signs @ differences + maps * _errors_of_seeds(PERMUTATIONS, *of_seeds)
+    if error is None:
+        of_seeds = np.nanmean(first, axis=(1, 2)), np.nanmean(second, axis=(1, 2))
+        error = _own_error(_of_trainings(*of_seeds, (1.0, -1.0), same_agents))
+    drawn = _widened(differences[chosen].mean(1), differences.mean(), maps) + error.draw(DRAWS)
+    permuted = signs @ differences + maps * error.draw(PERMUTATIONS)
     improvements = _improvements(first, second)
     improved = _widened(improvements.mean((0, 1))[chosen].mean(1), improvements.mean(), maps)
-    by_seed = _of_trainings(improvements.mean((1, 2)), improvements.mean((0, 2)), same_agents)
-    improved += _errors_of_seeds(DRAWS, *by_seed)
+    by_seed = improvements.mean((1, 2)), improvements.mean((0, 2))
+    improved += _own_error(_of_trainings(*by_seed, (1.0, 1.0), same_agents)).draw(DRAWS)
     return Comparison(
         difference=_interval(differences.mean(), drawn),
         improvement=_interval(improvements.mean(), np.clip(improved, 0.0, 1.0)),
@@ -236,16 +243,16 @@ class Term:
     training: str
 
 
-def contrast(terms: Sequence[Term], confidence: float = CONFIDENCE) -> Interval:
+def contrast(terms: Sequence[Term], confidence: float = CONFIDENCE, error: TrainingError | None = None) -> Interval:
     """Return a weighted sum of means over the same maps, and its interval with maps and training seeds crossed.
 
-    Every resample draws its maps once, for all terms and all seeds. What seeds add is summed seed by seed over the
-    terms of one training, and independent from one training to another. A training with a single seed adds nothing: of
-    it the interval speaks as of one agent.
+    Every resample draws its maps once, for all terms and all seeds. What other trainings would bring is common to the
+    terms of one training, and independent from one training to another.
 
     Args:
         terms: at least one, all with the same maps.
         confidence: of the interval.
+        error: of the sum; None: what these seeds say of it, all of them together.
 
     Returns:
         Bounds are NaN where one map was driven.
@@ -262,13 +269,9 @@ def contrast(terms: Sequence[Term], confidence: float = CONFIDENCE) -> Interval:
     if len(by_map) < 2:  # of how others differ, one map says nothing
         return Interval(float(by_map.mean()), float("nan"), float("nan"))
     chosen, _ = _resamples(len(by_map), DRAWS, PERMUTATIONS)
-    # A setting that fewer seeds were driven at is apart from the others of its agent: whose they are is not known.
-    of_trainings: defaultdict[tuple[str, int], Array] = defaultdict(lambda: np.zeros(1))
-    for term in terms:
-        of_seeds = term.weight * mean_over(term.values, (1, 2))
-        of_trainings[term.training, len(of_seeds)] = of_trainings[term.training, len(of_seeds)] + of_seeds
     value = by_map.mean()
-    drawn = _widened(by_map[chosen].mean(1), value, len(by_map)) + _errors_of_seeds(DRAWS, *of_trainings.values())
+    error = _own_error(_seeds_of(terms)) if error is None else error
+    drawn = _widened(by_map[chosen].mean(1), value, len(by_map)) + error.draw(DRAWS)
     return _interval(value, drawn, confidence)
 
 
@@ -338,38 +341,34 @@ def _widened(drawn: Array, value: float, maps: int) -> Array:
     return widened
 
 
-def _of_trainings(first: Array, second: Array, same_agents: bool) -> tuple[Array, ...]:
-    """Put what the seeds of two sides add together where they are the same agents."""
-    # A setting that fewer seeds were driven at is apart: whose seeds they are is not known.
-    return (first + second,) if same_agents and len(first) == len(second) else (first, second)
+_Seeds = Sequence[tuple[list[float], Array]]
+"""For each independent training the weights of its settings, and their means seed by seed, ``[S, K]``."""
 
 
-def _errors_of_seeds(number: int, *of_trainings: Array) -> Array:
-    """Draw by how much other training seeds would have changed a result.
+def _seeds_of(terms: Sequence[Term]) -> _Seeds:
+    """Put together what the seeds of each training say of its terms."""
+    # A setting that fewer seeds were driven at is apart from the others of its agent: whose they are is not known.
+    parts: defaultdict[tuple[str, int], list[Term]] = defaultdict(list)
+    for term in terms:
+        parts[term.training, len(term.values)].append(term)
+    return [
+        ([term.weight for term in part], np.stack([mean_over(term.values, (1, 2)) for term in part], axis=1))
+        for part in parts.values()
+    ]
 
-    The error of a mean over S seeds is their standard deviation over the square root of S, times Student's t with S - 1
-    degrees of freedom. Errors of independent trainings add up to one whose degrees of freedom are those of Welch and
-    Satterthwaite. The quantiles of t are drawn evenly, so that its far tails do not depend on luck.
 
-    Args:
-        number: how many errors.
-        of_trainings: for each independent training what each of its seeds adds, ``[S]``. NaN is a seed on which nothing
-            was measured.
+def _of_trainings(first: Array, second: Array, weights: tuple[float, float], same_agents: bool) -> _Seeds:
+    """Put together what the seeds of two sides say, each with its weight; same agents are one training."""
+    if same_agents and len(first) == len(second):
+        return [(list(weights), np.stack((first, second), axis=1))]
+    return [([weights[0]], first[:, None]), ([weights[1]], second[:, None])]
 
-    Returns:
-        ``[number]``; a training with one seed, whose spread nobody knows, adds nothing.
-    """
-    measured = [seeds[np.isfinite(seeds)] for seeds in of_trainings]
-    several = [seeds for seeds in measured if len(seeds) > 1]
-    variances = np.array([seeds.var(ddof=1) / len(seeds) for seeds in several])
-    total = variances.sum()
-    if total == 0.0:
-        return np.zeros(number)
-    freedom = total**2 / (variances**2 / [len(seeds) - 1 for seeds in several]).sum()
-    t = stats.t.ppf((np.arange(number) + 0.5) / number, freedom)
-    # Independent of the maps drawn.
-    drawn: Array = np.random.default_rng([_SEED, 1]).permutation(t) * total**0.5
-    return drawn
+
+def _own_error(seeds: _Seeds) -> TrainingError:
+    """Return the error of a sum of means by what its own seeds say."""
+    scatter = TrainingScatter.of(of_seeds for _, of_seeds in seeds)
+    measured = [(weights, int(np.isfinite(of_seeds).all(1).sum())) for weights, of_seeds in seeds]
+    return scatter.error((weights, trainings) for weights, trainings in measured if trainings)
 
 
 def _improvements(first: Array, second: Array) -> Array:

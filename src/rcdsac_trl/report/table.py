@@ -1,9 +1,4 @@
-"""The paper's table: collisions and rewards of every agent, beside the paper's own numbers.
-
-The paper's numbers are ``paper.csv``: table "Performance evaluation against baselines" of Choi, Dance, Kim, Hwang and
-Park (2021), *Risk-Conditioned Distributional Soft Actor-Critic for Risk-Sensitive Navigation*, under the names of our
-rows. Mean and standard deviation over 500 episodes, 50 maps x 10.
-"""
+"""The paper's table: collisions and rewards of every agent, beside the paper's own numbers."""
 
 from pathlib import Path
 
@@ -12,43 +7,33 @@ import pandas as pd
 
 from rcdsac_trl.report.formats import interval, number
 from rcdsac_trl.report.read import Episodes, possible
+from rcdsac_trl.report.rows import called, condition_label, names_of_rows, paper_table
 from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, bootstrap
+from rcdsac_trl.report.training_errors import TrainingErrors
 
 SENSORS = ("narrow", "sparse")
 TABULATED = ("collisions", "reward")
 KEY = ["agent", "beta", "collision_weight"]
-# Name and measure of rows that the paper's table lacks.
-_BEYOND_THE_PAPER = {
-    "rcdsac_pow_wide": ("RC-DSAC (resample)", "wide pow"),
-    "mppi": ("MPPI", ""),
-    "dwa": ("DWA", ""),
-    "pursuit": ("pure pursuit", ""),
-}
-
-
-def paper_table() -> pd.DataFrame:
-    """Return the paper's numbers, one row an agent, setting and sensor."""
-    return pd.read_csv(Path(__file__).with_name("paper.csv"))
 
 
 def own_table(episodes: Episodes) -> pd.DataFrame:
     """Return our numbers in the form of :func:`paper_table`, with `low` and `high` of each mean's interval beside it.
 
-    Standard deviations (ddof 0) are over the episodes, as the paper's; intervals are over maps, and over training seeds
-    where there are several.
+    Standard deviations (ddof 0) are over the episodes, as the paper's; intervals are over maps, and over trainings
+    where it is known how these differ.
     """
     conditions = episodes.conditions
-    rows = []
+    rows, errors = [], TrainingErrors(episodes)
     for _, condition in conditions[conditions["beta_controller"].isna()].iterrows():  # the paper turns no beta
         row = {key: condition[key] for key in [*KEY, "sensor"]}
         for metric in TABULATED:
             values = episodes.of(condition, metric)
-            found = bootstrap(values).within(*possible(metric))
+            found = bootstrap(values, error=errors.of(condition, metric)).within(*possible(metric))
             row |= {f"{metric}_mean": found.value, f"{metric}_std": np.nanstd(values)}
             bounds = (found.low, found.high) if values.shape[1] > 1 else (np.nan, np.nan)  # one map tells none
             row |= dict(zip((f"{metric}_low", f"{metric}_high"), bounds, strict=True))
         rows.append(row)
-    return pd.DataFrame(rows).merge(_names(), on="agent", how="left")
+    return pd.DataFrame(rows).merge(names_of_rows(), on="agent", how="left")
 
 
 def missing_rows(episodes: Episodes) -> dict[str, list[str]]:
@@ -89,60 +74,6 @@ def averaged_settings() -> pd.MultiIndex:
     """Return measure and setting of what the paper's text averages over: where it evaluates DSAC."""
     paper = paper_table()
     return pd.MultiIndex.from_frame(paper[paper["name"] == "DSAC"][["psi", "beta"]].drop_duplicates())
-
-
-def condition_label(
-    agent: str, sensor: str, beta: float, weight: float, controller: str | None, sensors: int = 1
-) -> str:
-    """Name a condition in figures and lists; the sensor only where there are several."""
-    told = setting_label(beta, weight, controller)
-    return f"{row_label(agent)}{told}{', ' + sensor if sensors > 1 else ''}"
-
-
-def setting_label(beta: float, weight: float, controller: str | None) -> str:
-    """Name the setting that an agent is driven at, as it stands behind the agent's name.
-
-    Example:
-        >>> nothing = float("nan")
-        >>> setting_label(-1.0, nothing, None), setting_label(nothing, nothing, "goal_distance")
-        (' β = -1', ' β by goal distance')
-    """
-    if isinstance(controller, str):
-        return f" β by {controller.replace('_', ' ')}"
-    return f" β = {beta:g}" if pd.notna(beta) else f" w_coll = {weight:g}" if pd.notna(weight) else ""
-
-
-def row_label(agent: str) -> str:
-    """Name a row as the paper does, with its measure.
-
-    Example:
-        >>> row_label("rcdsac_pow"), row_label("mppi"), row_label("mine")
-        ('RC-DSAC (resample) pow', 'MPPI', 'mine')
-    """
-    return " ".join(part for part in called(agent) if part)
-
-
-def has_dial(agent: str) -> bool:
-    """Return whether one policy of a row is driven at all its β; each of DSAC's is of another training.
-
-    Example:
-        >>> has_dial("rcdsac_cvar"), has_dial("dsac_cvar")
-        (True, False)
-    """
-    return called(agent)[0] != "DSAC"
-
-
-def _names() -> pd.DataFrame:
-    """Return what the paper calls each of our rows, and the row's measure."""
-    return paper_table()[["agent", "name", "psi"]].drop_duplicates()
-
-
-def called(agent: str) -> tuple[str, str]:
-    """Return the name and risk measure of a row, the paper's where it has it; of an unknown one its own name."""
-    names = _names().set_index("agent").fillna("")
-    if agent in names.index:
-        return str(names.at[agent, "name"]), str(names.at[agent, "psi"])
-    return _BEYOND_THE_PAPER.get(agent, (agent, ""))
 
 
 def _pairs(table: pd.DataFrame) -> list[tuple[str, str]]:

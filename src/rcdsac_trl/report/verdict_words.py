@@ -81,15 +81,16 @@ def missing(finding: Finding) -> str:
 
 
 def over(finding: Finding) -> str:
-    """Say what the intervals are over: maps, and training seeds where there are several."""
+    """Say what the intervals are over: maps, and training seeds where it is known how these differ."""
     expectations = [one.expectation for one in finding.judged]
     fewest, most = finding.measured.num_seeds(expectations)
     if not most:
         return ""
     units = f"{finding.measured.num_units(expectations)} {finding.measured.unit}"
-    if most == 1:
+    if not finding.measured.speaks_of_trainings(expectations):
         return f"{units} alone: one training seed"
-    return f"{units} and {most} training seeds" + (f", of some agents {fewest}" if fewest < most else "")
+    seeds = f"{most} training seed{'s' if most > 1 else ''}"
+    return f"{units} and {seeds}" + (f", of some agents {fewest}" if fewest < most else "")
 
 
 def as_table(findings: Sequence[Finding]) -> pd.DataFrame:

@@ -10,7 +10,8 @@ same maps, whose interval crosses maps and training seeds (:func:`rcdsac_trl.rep
   1 - (1 - c) / k, since one of many seems to fail by chance. A claim about *any* is its mirror image.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Literal, NamedTuple
@@ -19,6 +20,8 @@ import numpy as np
 
 from rcdsac_trl.report.read import METRIC_NAMES
 from rcdsac_trl.report.statistics import CONFIDENCE, Array, Interval, Term, contrast, of_these_agents
+from rcdsac_trl.report.training_errors import Training, training_of
+from rcdsac_trl.report.training_scatter import TrainingError, TrainingScatter
 
 COMPARABLE = 0.05
 """Share of a mean that counts as no difference. The paper calls 0.95 and 0.91 collisions comparable, which is 4 %, and
@@ -136,7 +139,7 @@ class Finding:
         missing: what was not measured of it.
         measured: by what it was judged.
         of_agents: the same over maps alone, which speaks of the agents that were driven and not of their recipe; None
-            where there is one training seed, of which the verdict speaks already.
+            where the verdict speaks of them already, since nobody knows how another training would differ.
     """
 
     claim: Claim
@@ -155,6 +158,8 @@ class Measured:
         paper: a metric under a cell by the paper; NaN if it has none.
         unit: what the second axis is, in the plural: ``"maps"``.
         names: what metrics are called.
+        scatter: how far trainings lie apart, under a sensor and in a metric; None: nothing but the cells of a claim
+            says so.
     """
 
     def __init__(
@@ -163,12 +168,14 @@ class Measured:
         paper: Callable[[Cell, str], float],
         unit: str = "maps",
         names: Mapping[str, str] = METRIC_NAMES,
+        scatter: Callable[[str, str], TrainingScatter] | None = None,
     ) -> None:
         self._values = values
         self._paper = paper
         self._known: dict[tuple[Cell, str], Array | None] = {}
         self.unit = unit
         self.names = names
+        self._scatter = scatter
 
     def of_agents(self) -> "Measured":
         """Return the same for these very agents, of which training seeds say nothing of other trainings."""
@@ -178,6 +185,20 @@ class Measured:
             return None if values is None else of_these_agents(values)
 
         return Measured(together, self._paper, self.unit, self.names)
+
+    def error(self, expectation: Expectation) -> TrainingError | None:
+        """Return what other trainings would change in the sum of an expectation; None: its own cells say so."""
+        if self._scatter is None:
+            return None
+        parts: dict[str, defaultdict[tuple[Training, int], list[float]]] = {}
+        for weight, cell, values in self._weighted(expectation):
+            of_sensor = parts.setdefault(cell.sensor, defaultdict(list))
+            of_sensor[training_of(cell.agent, cell.beta, cell.sensor), len(values)].append(weight)
+        error = TrainingError()
+        for sensor, of_sensor in parts.items():
+            scatter = self._scatter(sensor, expectation.metric)
+            error += scatter.error((weights, seeds) for (_, seeds), weights in of_sensor.items())
+        return error
 
     def values(self, cell: Cell, metric: str) -> Array | None:
         """Return what was measured under a cell, None if nothing was."""
@@ -201,18 +222,30 @@ class Measured:
 
     def interval(self, expectation: Expectation, confidence: float) -> Interval:
         """Return the sum of an expectation, all of whose cells are there, with its interval."""
-        terms = []
+        terms = [
+            Term(weight, values, str(training_of(cell.agent, cell.beta, cell.sensor)))
+            for weight, cell, values in self._weighted(expectation)
+        ]
+        return contrast(terms, confidence, self.error(expectation))
+
+    def _weighted(self, expectation: Expectation) -> Iterator[tuple[float, Cell, Array]]:
         for group, weight in zip(expectation.groups, expectation.weights, strict=True):
             for cell in group.cells:
                 values = self.values(cell, expectation.metric)
                 assert values is not None
-                terms.append(Term(weight / len(group.cells), values, f"{cell.agent} {cell.sensor}"))
-        return contrast(terms, confidence)
+                yield weight / len(group.cells), cell, values
 
     def num_seeds(self, expectations: Sequence[Expectation]) -> tuple[int, int]:
         """Return the fewest and the most training seeds of what was measured; 0 if nothing was."""
         seeds = [shape[0] for shape in self._shapes(expectations)]
         return min(seeds, default=0), max(seeds, default=0)
+
+    def speaks_of_trainings(self, expectations: Sequence[Expectation]) -> bool:
+        """Say whether intervals are over other trainings, too."""
+        if self._scatter is None:
+            return self.num_seeds(expectations)[1] > 1
+        cells = {(cell.sensor, one.metric) for one in expectations for cell in one.cells}
+        return any(self._scatter(*of).is_known for of in cells)
 
     def num_units(self, expectations: Sequence[Expectation]) -> int:
         """Return how many maps, or other units, were driven; 0 if nothing was measured."""
@@ -256,8 +289,10 @@ def judge(interval: Interval, expected: Expected, margin: float) -> Verdict:
 def find(claim: Claim, measured: Measured) -> Finding:
     """Judge a claim by what was measured."""
     found = _find(claim, measured)
-    _, most = measured.num_seeds([judged.expectation for judged in found.judged])
-    return replace(found, of_agents=_find(claim, measured.of_agents())) if most > 1 else found
+    expectations = [judged.expectation for judged in found.judged]
+    if measured.speaks_of_trainings(expectations):
+        return replace(found, of_agents=_find(claim, measured.of_agents()))
+    return found
 
 
 def _find(claim: Claim, measured: Measured) -> Finding:
