@@ -135,7 +135,7 @@ def test_the_table_of_seeds_is_what_all_trainings_drove() -> None:
     rows = [(*driven[0][:2], 2.0, *driven[0][2:]), *((agent, seed, 1.0, *of) for agent, seed, *of in driven)]
     columns = ["agent", "train_seed", "collision_weight", "collisions", "reward"]
     told = {"sensor": "narrow", "beta": None, "beta_controller": None, "measure": None, "helped": "", "map": 0}
-    told["trained"] = True
+    told |= {"trained": True, "weights": None}
     episodes = pd.DataFrame(rows, columns=columns).assign(**told, episode=0)
     protocol = {"num_maps": 1, "num_episodes": 1}
     agents = [Episodes(rows, protocol, pd.DataFrame()) for _, rows in episodes.groupby("agent")]

@@ -108,7 +108,8 @@ def main() -> None:
     """Read, draw."""
     # An agent or a baseline a folder; those of the study lie deeper, or are called otherwise.
     narrow = sorted(RESULTS.glob("*-narrow"), key=lambda run: (place(run), run))
-    episodes = read_episodes([run for run in narrow if not run.name.startswith(BESIDE)])
+    compared = [run for run in narrow if not run.name.startswith(BESIDE)]
+    episodes = read_episodes([training for run in compared for training in _trainings(run.name)])
     of_both_sensors = read_episodes([*narrow, *sorted(RESULTS.glob("*-sparse"))])
     reference = episodes.conditions["agent"].tolist().index(REFERENCE)
     figures: dict[str, Figure | None] = {

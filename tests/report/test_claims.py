@@ -84,7 +84,7 @@ def test_fewer_collisions(mean: float, spread: float, verdict: Verdict) -> None:
     (judged,) = found.judged
     assert judged.here == pytest.approx((mean, 2.0))
     assert judged.interval.value == pytest.approx(mean - 2.0)
-    assert over(found) == "30 maps alone: one training seed"
+    assert over(found) == "30 maps alone: one training of each agent"
     assert found.of_agents is None
 
 
@@ -168,7 +168,7 @@ def test_seeds_that_disagree_cannot_tell_what_their_maps_can() -> None:
     a = np.concatenate([maps + 1.0, maps + 1.9])
     found = find(claim, measured(a=a, b=maps_around(2.0)))
     assert found.verdict == Verdict.OPEN
-    assert over(found) == "30 maps and 2 training seeds, of some agents 1"
+    assert over(found) == "30 maps and other trainings: 1 to 2 of each agent here"
     assert found.of_agents is not None
     assert found.of_agents.verdict == Verdict.HOLDS
     assert of_agents(found).endswith("]. Holds.")
@@ -197,6 +197,7 @@ def made_up(value: Callable[[pd.Series, str], Array], table: pd.DataFrame | None
                 "measure": None,
                 "helped": "",
                 "trained": True,
+                "weights": None,
                 "beta_controller": None,
                 "train_seed": 0,
                 "map": np.repeat(np.arange(MAPS), EPISODES),
@@ -298,7 +299,7 @@ def test_the_course_by_the_papers_own_numbers() -> None:
     found = judged_course_claims(driven())
     assert [found[number].verdict for number in (0, 2)] == [Verdict.HOLDS] * 2
     assert [judged.here for judged in found[3].judged] == [pytest.approx((110.25, 114.375))]
-    assert over(found[0]) == "6 runs alone: one training seed"
+    assert over(found[0]) == "6 runs alone: one training of each agent"
     assert "Weakest: RC-DSAC CVaR β = 0.75: 0.50 (paper 0.50), SAC: 2.50 (paper 2.50) collisions a run." in numbers(
         found[0]
     )

@@ -551,7 +551,7 @@ def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
         write_report(results, folders[1])
     assert {path.name for path in out.iterdir()} == {
         *(f"table.{suffix}" for suffix in ("md", "csv", "tex", "html")),
-        *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "averages", "collision_summary")),
+        *(f"{name}.csv" for name in ("summary", "comparisons", "trends", "trainings", "averages", "collision_summary")),
         "claims.csv",
         "claims.md",
         "claims_evidence.csv",

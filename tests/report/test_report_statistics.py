@@ -104,9 +104,8 @@ def test_seeds_that_differ_more_than_the_agents_decide_nothing() -> None:
     assert found.difference.value == pytest.approx(1.0)
     assert found.difference.low < -10.0 < 12.0 < found.difference.high
     assert found.p_value > 0.3
-    # 0, 1 and 2 pairs of seeds are won of 6, on every map; another training could win all or none.
-    assert found.improvement.value == pytest.approx(3 / 6)
-    assert (found.improvement.low, found.improvement.high) == (0.0, 1.0)
+    # 0, 1 and 2 pairs of seeds are won of 6, on every map.
+    assert vars(found.improvement) == pytest.approx({"value": 3 / 6, "low": 3 / 6, "high": 3 / 6})
 
 
 def test_a_seed_on_which_nothing_was_measured_says_nothing_of_the_seeds() -> None:

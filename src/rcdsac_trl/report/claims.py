@@ -6,7 +6,7 @@ settings of each that DSAC has: so do the claims here.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import pandas as pd
 
@@ -15,6 +15,7 @@ from rcdsac_trl.report.rows import condition_label, paper_table
 from rcdsac_trl.report.statistics import Array
 from rcdsac_trl.report.table import SENSORS, averaged_settings
 from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_scatter import TrainingError
 from rcdsac_trl.report.verdicts import Cell, Claim, Expectation, Finding, Group, Measured, find, than
 
 _RESAMPLE, _STORED, _DSAC, _RCWR, _SAC = "RC-DSAC (resample)", "RC-DSAC (stored)", "DSAC", "RCWR", "SAC"
@@ -48,7 +49,14 @@ def _measured(episodes: Episodes) -> Measured:
     def printed(cell: Cell, metric: str) -> float:
         return float(paper[cell][f"{metric}_mean"]) if cell in paper else math.nan
 
-    return Measured(values, printed, scatter=TrainingErrors(episodes).scatter)
+    errors = TrainingErrors(episodes)
+
+    def error(terms: Sequence[tuple[float, Cell]], metric: str) -> TrainingError | None:
+        if not all(errors.is_known(cell.sensor, metric) for _, cell in terms):
+            return None
+        return errors.of_sum([(weight, own[cell]) for weight, cell in terms], metric)
+
+    return Measured(values, printed, error=error)
 
 
 def _cell(row: pd.Series) -> Cell:

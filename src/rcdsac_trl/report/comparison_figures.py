@@ -67,7 +67,7 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
     axes.axvline(0, color=INK, linewidth=0.9, linestyle=(0, (1, 2)))
     axes.set_yticks(range(len(others)), [_beside(conditions.iloc[i]) for i in others])
     _dress_rows(axes, len(others))
-    handles = _difference_legend(errors.scatter(base["sensor"], metric).is_known)
+    handles = _difference_legend(errors.is_known(base["sensor"], metric))
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9, labelcolor=INK)
     return figure
 

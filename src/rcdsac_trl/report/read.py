@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -138,8 +138,9 @@ class Episodes:
 
     Attributes:
         table: one row an episode: :data:`CONDITION`, `mean_beta`, `train_seed`, `map`, `episode`, the metrics that
-            all have, `helped` as in :class:`Evaluation`, `trained`: whether an agent drove, not a planner, and
-            `diagnosed`: whether its collisions are among `collisions`.
+            all have, `helped` as in :class:`Evaluation`, `trained`: whether an agent drove, not a planner,
+            `weights`: the digest of an agent's weights, None where it is not known, and `diagnosed`: whether its
+            collisions are among `collisions`.
         protocol: of all evaluations.
         collisions: one row a collision, of the evaluations that wrote ``collisions.csv``, with :data:`CONDITION`.
     """
@@ -164,9 +165,23 @@ class Episodes:
 
     def of(self, condition: pd.Series, metric: str) -> Array:
         """Return a metric under a condition: ``[training seeds, maps, episodes]``."""
-        ordered = under(self.table, condition, CONDITION).sort_values(list(_EPISODE))
         shape = (-1, self.protocol["num_maps"], self.protocol["num_episodes"])
-        return ordered[metric].to_numpy(np.float64).reshape(shape)
+        return self._by_condition[_key(condition[list(CONDITION)])][metric].to_numpy(np.float64).reshape(shape)
+
+    def seeds(self, condition: pd.Series) -> list[int]:
+        """Return the training seeds under a condition, in the order of :meth:`of`."""
+        return self._by_condition[_key(condition[list(CONDITION)])]["train_seed"].unique().tolist()
+
+    @cached_property
+    def _by_condition(self) -> dict[tuple[Any, ...], pd.DataFrame]:
+        """The rows of each condition in the order of :meth:`of`: a report asks for them a thousand times."""
+        groups = self.table.sort_values(list(_EPISODE)).groupby(list(CONDITION), dropna=False, sort=False)
+        return {_key(values): rows for values, rows in groups}
+
+
+def _key(values: Iterable[Any]) -> tuple[Any, ...]:
+    """Return values that can be looked up: those that are missing equal each other."""
+    return tuple(None if pd.isna(value) else value for value in values)
 
 
 def read_episodes(folders: Sequence[Path]) -> Episodes:
@@ -191,6 +206,7 @@ def read_episodes(folders: Sequence[Path]) -> Episodes:
             train_seed=evaluation.described.get("train_seed") or 0,
             # Evaluations of earlier versions that say nothing of it are of agents.
             trained=evaluation.described.get("train_seed", 0) is not None,
+            weights=evaluation.described.get("weights_sha256"),
             folder=str(evaluation.folder),
             diagnosed=evaluation.collisions is not None,
         )

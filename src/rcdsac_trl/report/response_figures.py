@@ -57,7 +57,7 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
         return None
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     errors = TrainingErrors(episodes)
-    known = any(errors.scatter(rows.iloc[0]["sensor"], "reward").is_known for _, rows in groups)
+    known = any(errors.is_known(rows.iloc[0]["sensor"], "reward") for _, rows in groups)
     figure.suptitle(
         f"What β does, {_MEASURES.get(measure, measure)}: averse at the left; "
         f"95 % intervals over maps{' (dark), and trainings, too (pale)' if known else ''}",
@@ -112,10 +112,13 @@ def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str
     for number, ((name, rows), color) in enumerate(zip(groups, series(len(groups)), strict=True)):
         values = [episodes.of(condition, metric) for _, condition in rows.iterrows()]
         marker = MARKERS[number % len(MARKERS)]
-        if errors.scatter(rows.iloc[0]["sensor"], metric, statistic).is_known:
+        if errors.is_known(rows.iloc[0]["sensor"], metric, statistic):
             of_trainings = [errors.of(condition, metric, statistic) for _, condition in rows.iterrows()]
-            over_trainings = [bounded(v, metric, statistic, e) for v, e in zip(values, of_trainings, strict=True)]
-            _shade(axes, rows["beta"], over_trainings, color, alpha=0.08)
+            wider = [bounded(v, metric, statistic, error) for v, error in zip(values, of_trainings, strict=True)]
+            if has_dial(rows.iloc[0]["agent"]):
+                _shade(axes, rows["beta"], wider, color, alpha=0.08)
+            else:
+                axes.vlines(rows["beta"], [i.low for i in wider], [i.high for i in wider], color=color, linewidth=0.7)
         alone = [bounded(statistics.of_these_agents(v), metric, statistic) for v in values]
         middle = [interval.value for interval in alone]
         if has_dial(rows.iloc[0]["agent"]):

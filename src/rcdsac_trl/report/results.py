@@ -12,6 +12,7 @@ from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_claims import judged_course_claims
 from rcdsac_trl.report.course_table import course_table
 from rcdsac_trl.report.read import Episodes
+from rcdsac_trl.report.training_errors import TrainingErrors
 from rcdsac_trl.report.verdicts import Finding
 
 
@@ -64,6 +65,11 @@ class Results:
     def comparisons(self) -> pd.DataFrame:
         """Every pair of conditions."""
         return findings.comparisons(self.episodes)
+
+    @cached_property
+    def trainings(self) -> pd.DataFrame:
+        """How far the trainings of each agent lie apart."""
+        return TrainingErrors(self.episodes).trainings(findings.COMPARED)
 
     @cached_property
     def trends(self) -> pd.DataFrame:

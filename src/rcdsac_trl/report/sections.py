@@ -11,6 +11,7 @@ from rcdsac_trl.report.course_table import DIRECTIONS
 from rcdsac_trl.report.formats import heading, interval, number, p_value
 from rcdsac_trl.report.learning_figures import learning_panels
 from rcdsac_trl.report.page import Card, Figures, Folded, Heading, Part, Section
+from rcdsac_trl.report.read import METRIC_NAMES
 from rcdsac_trl.report.response_figures import beta_panels
 from rcdsac_trl.report.results import Results
 from rcdsac_trl.report.rows import condition_label
@@ -21,8 +22,8 @@ from rcdsac_trl.report.verdicts import COMPARABLE, Finding, Verdict
 _VERDICTS = (
     f"A claim holds, or does not, where the {CONFIDENCE_TEXT} interval of the difference says so. Otherwise it cannot "
     "be told. Differences are paired: all agents met the same maps, starts and goals. Intervals are over maps, and "
-    "over trainings where some agent has several: how these differ is pooled over all agents, so that it counts for "
-    "those with one training, too. Where each has one, intervals speak of these agents alone: another may differ.",
+    "over trainings where some agent of the sensor has several: how these differ is pooled over all agents, and counts "
+    "for those with one training, too. Where each has one, intervals speak of these agents alone: another may differ.",
     f"Differences below {100 * COMPARABLE:.0f} % of the mean count as none. A claim about many rows fails only where "
     "one of them fails beyond what one of so many does by chance. The paper's numbers stand in brackets. Its maps are "
     "not available: compare differences, not levels.",
@@ -82,6 +83,8 @@ def sections(results: Results) -> list[Section]:
     if len(results.causes):
         hit = collision_report.wide(results.causes)
         made.append(Section("Why does it still collide?", [*_CAUSES, Figures([collision_causes(results.causes)]), hit]))
+    if results.trainings["sd"].notna().any():
+        made.append(Section("How far trainings lie apart", _trainings(results)))
     made.append(Section("Everything measured", _everything(results)))
     if results.learnt:
         panels = learning_panels(results.learnt)
@@ -147,7 +150,7 @@ def _paper(results: Results) -> list[Part]:
     lacking = [f"{sensor}: {', '.join(rows)}" for sensor, rows in table.missing_rows(results.episodes).items() if rows]
     parts: list[Part] = [
         f"Mean ± standard deviation over {maps * each} episodes a training seed, as in the paper, and the "
-        f"{CONFIDENCE_TEXT} interval of the mean over maps (and trainings, where some agent has several).",
+        f"{CONFIDENCE_TEXT} interval of the mean over maps (and trainings, where an agent of the sensor has several).",
         _rows_named(results.paper),
     ]
     if lacking:
@@ -225,7 +228,7 @@ def _course_column(name: str) -> tuple[str, str]:
 def _beta(results: Results) -> list[Part]:
     parts: list[Part] = [
         f"Averse at the left. Shaded: the {CONFIDENCE_TEXT} interval of these agents, if other maps of the same kind "
-        "had been drawn. Paler, where some agent has several trainings: if these had been others, too."
+        "had been drawn. Paler, where some agent of the sensor has several trainings: if these had been others."
     ]
     for measure in results.measures:
         if panels := beta_panels(results.episodes, measure):
@@ -301,7 +304,7 @@ def _pairs(results: Results) -> list[Part]:
     shown = pairs[pairs["first"].isin(references) | pairs["second"].isin(references)]
     return [
         f"A dot a map; a thick line is the {CONFIDENCE_TEXT} interval of these agents over other maps, a thin one over "
-        "other trainings, too, where some agent has several.",
+        "other trainings, too, where some agent of the sensor has several.",
         Figures(figures),
         "Probability: that an episode of the first is better than one of the second on the same map (fewer collisions, "
         "more reward). p-values: sign permutations over maps, with the error of the trainings where some agent has "
@@ -336,6 +339,30 @@ def _difference_intervals(rows: pd.DataFrame, metric: str) -> list[str]:
     return [interval(low, high, metric, signed=True) for low, high in zip(rows["low"], rows["high"], strict=True)]
 
 
+def _trainings(results: Results) -> list[Part]:
+    shown: list[Part] = []
+    for metric, rows in results.trainings.groupby("metric", sort=False):
+        names = [
+            condition_label(agent, sensor, nothing if beta is None else beta, nothing, None, 2)
+            for nothing in (float("nan"),)
+            for agent, sensor, beta in rows[["agent", "sensor", "beta"]].itertuples(index=False)
+        ]
+        columns = {
+            "agent": names,
+            "trainings": rows["trainings"].astype(str).tolist(),
+            "standard deviation": [number(value, str(metric)) for value in rows["sd"]],
+            "the others'": [number(value, str(metric)) for value in rows["sd_others"]],
+            "": ["for sure larger: not pooled" if apart else "" for apart in rows["apart"]],
+        }
+        shown += [Heading(METRIC_NAMES[str(metric)]), pd.DataFrame(columns)]
+    return [
+        "Of one setting, from training to training; the noise of the episodes is part of it. Pooled over the agents of "
+        "a sensor it widens all intervals. An agent whose trainings for sure lie farther apart (p < 0.001) is not "
+        "pooled: its own alone count for it.",
+        *shown,
+    ]
+
+
 def _everything(results: Results) -> list[Part]:
     """Lay the summary out with a row a condition."""
     metrics = {name: metric for name, (metric, _) in findings.SUMMARISED.items()}
@@ -349,4 +376,7 @@ def _everything(results: Results) -> list[Part]:
     wide = cells.pivot(index="condition", columns="column", values="text")
     ordered = wide.loc[cells["condition"].drop_duplicates(), cells["column"].drop_duplicates()]
     shown = ordered.rename_axis(None, axis=1).reset_index().rename(columns={"condition": "agent"})
-    return [f"Mean [{CONFIDENCE_TEXT} interval over maps, and over trainings where some agent has several].", shown]
+    return [
+        f"Mean [{CONFIDENCE_TEXT} interval over maps, and over trainings where an agent of the sensor has several].",
+        shown,
+    ]

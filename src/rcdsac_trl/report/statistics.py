@@ -4,8 +4,9 @@ many independent observations.
 Values come as arrays ``[S, M, E]``: training seeds, maps, episodes on a map. Seeds and maps are crossed, not nested:
 the agents of all seeds met the same maps. So a resample draws its maps once, for all seeds. The seeds themselves are
 few, and resampling few values gives intervals that are too narrow (95 % intervals of two seeds hold the truth half of
-the time): what seeds add to an error is taken from Student's t distribution, with a scatter that is pooled over all
-agents there are (:mod:`rcdsac_trl.report.training_scatter`).
+the time): what seeds add to an error is taken from Student's t distribution. How far they lie apart is pooled over
+agents: over all of a report where it gives the error (:mod:`rcdsac_trl.report.training_errors`), else over those that
+are compared.
 """
 
 from collections import defaultdict
@@ -201,26 +202,24 @@ def compare(
     Intervals resample maps, for both sides and all seeds at once. The test permutes, map by map, which side is which
     (the mean of a map over seeds and episodes is one observation): exact, and without an assumption about the
     distribution. Every resample and permutation also gets an error that other trainings would bring. Of two settings
-    of the same agents what they have in common cancels.
+    of the same agents what they have in common cancels. The improvement's interval is over maps alone.
 
     Args:
         first: ``[S, M, E]``.
         second: ``[S', M, E]``, the same maps, starts and goals.
         same_agents: whether both sides were driven by the same agents, in one order; else they are independent.
-        error: of the difference; None: what these seeds say of it. That of the improvement is always theirs.
+        error: of the difference; None: what these seeds say of it.
     """
     differences = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))
     maps = len(differences)
     chosen, signs = _resamples(maps, DRAWS, PERMUTATIONS)
     if error is None:
-        of_seeds = np.nanmean(first, axis=(1, 2)), np.nanmean(second, axis=(1, 2))
-        error = _own_error(_of_trainings(*of_seeds, (1.0, -1.0), same_agents))
+        names = ("both", "both") if same_agents else ("first", "second")
+        error = _own_error(_seeds_of([Term(1.0, first, names[0]), Term(-1.0, second, names[1])]))
     drawn = _widened(differences[chosen].mean(1), differences.mean(), maps) + error.draw(DRAWS)
     permuted = signs @ differences + maps * error.draw(PERMUTATIONS)
     improvements = _improvements(first, second)
     improved = _widened(improvements.mean((0, 1))[chosen].mean(1), improvements.mean(), maps)
-    by_seed = improvements.mean((1, 2)), improvements.mean((0, 2))
-    improved += _own_error(_of_trainings(*by_seed, (1.0, 1.0), same_agents)).draw(DRAWS)
     return Comparison(
         difference=_interval(differences.mean(), drawn),
         improvement=_interval(improvements.mean(), np.clip(improved, 0.0, 1.0)),
@@ -341,12 +340,8 @@ def _widened(drawn: Array, value: float, maps: int) -> Array:
     return widened
 
 
-_Seeds = Sequence[tuple[list[float], Array]]
-"""For each independent training the weights of its settings, and their means seed by seed, ``[S, K]``."""
-
-
-def _seeds_of(terms: Sequence[Term]) -> _Seeds:
-    """Put together what the seeds of each training say of its terms."""
+def _seeds_of(terms: Sequence[Term]) -> list[tuple[list[float], Array]]:
+    """Return for each independent training the weights of its terms, and their means seed by seed, ``[S, K]``."""
     # A setting that fewer seeds were driven at is apart from the others of its agent: whose they are is not known.
     parts: defaultdict[tuple[str, int], list[Term]] = defaultdict(list)
     for term in terms:
@@ -357,18 +352,14 @@ def _seeds_of(terms: Sequence[Term]) -> _Seeds:
     ]
 
 
-def _of_trainings(first: Array, second: Array, weights: tuple[float, float], same_agents: bool) -> _Seeds:
-    """Put together what the seeds of two sides say, each with its weight; same agents are one training."""
-    if same_agents and len(first) == len(second):
-        return [(list(weights), np.stack((first, second), axis=1))]
-    return [([weights[0]], first[:, None]), ([weights[1]], second[:, None])]
-
-
-def _own_error(seeds: _Seeds) -> TrainingError:
+def _own_error(seeds: Sequence[tuple[list[float], Array]]) -> TrainingError:
     """Return the error of a sum of means by what its own seeds say."""
-    scatter = TrainingScatter.of(of_seeds for _, of_seeds in seeds)
-    measured = [(weights, int(np.isfinite(of_seeds).all(1).sum())) for weights, of_seeds in seeds]
-    return scatter.error((weights, trainings) for weights, trainings in measured if trainings)
+    scatter = TrainingScatter([of_seeds for _, of_seeds in seeds])
+    trainings = []
+    for number, (weights, of_seeds) in enumerate(seeds):
+        if measured := int(np.isfinite(of_seeds).all(1).sum()):
+            trainings += [(number, {place: weight / measured for place, weight in enumerate(weights)})] * measured
+    return scatter.error(trainings)
 
 
 def _improvements(first: Array, second: Array) -> Array:

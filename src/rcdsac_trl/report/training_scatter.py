@@ -5,15 +5,13 @@ t with one degree of freedom is 12.7. The trainings of all agents together do. S
 analysis of variance is: trainings of every agent are taken to scatter alike. An agent with a single training then has
 an interval that covers other trainings, too.
 
-A training moves all settings of its agent together, and each of them for itself::
-
-    mean of setting k after training s = agent k + common_s + own_ks
-
-Its two mean squares are estimated: that of the trainings' means over the settings, and that of what is left. Both hold
-the noise of the episodes, so intervals are a little too wide rather than too narrow.
+What a training moves, it may move at all settings of its agent, along them, or at each for itself. Nothing is assumed
+of that: of a sum of means over settings, such as a difference between two, that very sum scatters from training to
+training, in each agent that has several and as many settings. Both hold the noise of the episodes, which the maps of a
+resample hold, too: intervals are too wide rather than too narrow.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +21,8 @@ from scipy import stats
 Array = NDArray[np.float64]
 
 _SEED = 1
+_APART = 0.001
+"""An agent that scatters more than the others by chance this rarely is not pooled with them."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,10 @@ class TrainingError:
 
     def __add__(self, other: "TrainingError") -> "TrainingError":
         """Add an independent error, its degrees of freedom by Welch and Satterthwaite."""
-        return _summed((self.variance, self.freedom), (other.variance, other.freedom))
+        total = self.variance + other.variance
+        if total == 0.0:
+            return TrainingError()
+        return TrainingError(total, total**2 / (self.variance**2 / self.freedom + other.variance**2 / other.freedom))
 
     def draw(self, number: int) -> Array:
         """Draw so many errors: quantiles of Student's t, evenly, so that its far tails do not depend on luck.
@@ -56,88 +59,109 @@ class TrainingError:
         return drawn
 
 
-@dataclass(frozen=True)
 class TrainingScatter:
-    """Mean squares of trainings, pooled over agents.
+    """How far trainings lie apart, pooled over agents.
+
+    Args:
+        agents: an agent each, ``[S, K]``: means after S trainings, at K settings in their order. NaN is a setting at
+            which that training was not measured.
 
     Attributes:
-        of_means: mean square of the trainings' means over the settings of their agent, around the agent's.
-        means_freedom: its degrees of freedom; 0 where no agent has two trainings.
-        of_settings: mean square of what is left, setting by setting.
-        settings_freedom: its degrees of freedom; 0 where no agent with two trainings has two settings.
-        share: of `of_settings` in `of_means`: one over the number of settings, mean over the trainings.
+        apart: numbers of the agents whose trainings for sure lie farther apart than the others' (an F test, p < 0.001):
+            they are not pooled, and their own trainings alone count for them.
+
+    Example:
+        >>> scatter = TrainingScatter([np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0]])])
+        >>> scatter.error([(1, {0: 1.0})])  # the one training of the second agent
+        TrainingError(variance=2.0, freedom=1)
+        >>> scatter.error([(0, {0: 1.0, 1: -1.0})]).variance  # what a training of the first moves at both, cancels
+        0.0
     """
 
-    of_means: float = 0.0
-    means_freedom: int = 0
-    of_settings: float = 0.0
-    settings_freedom: int = 0
-    share: float = 0.0
+    def __init__(self, agents: Sequence[Array]) -> None:
+        self._agents = list(agents)
+        self.apart: frozenset[int] = frozenset()
+        while (farthest := self._farthest_apart()) is not None:
+            self.apart |= {farthest}
 
     @property
     def is_known(self) -> bool:
         """Whether any agent has two trainings."""
-        return self.means_freedom > 0
+        return self._freedom(range(len(self._agents))) > 0
 
-    @classmethod
-    def of(cls, trainings: Iterable[Array]) -> "TrainingScatter":
-        """Learn it from the trainings of each agent.
+    def spread(self, agent: int) -> tuple[float, int]:
+        """Return the variance of one setting from training to training by an agent's own, and its freedom."""
+        return _mean_square([self._agents[agent]], [1.0])
 
-        Args:
-            trainings: an agent each, ``[S, K]``: means after S trainings, at K settings. A training of which one is NaN
-                is left out.
+    def pooled(self, but: int | None = None) -> tuple[float, int]:
+        """Return the same of all agents that are pooled, but for one."""
+        return _mean_square([self._agents[number] for number in self._pool() if number != but], [1.0])
 
-        Example:
-            >>> TrainingScatter.of([np.array([[1.0], [3.0]]), np.array([[5.0], [5.0]])]).of_means
-            1.0
-        """
-        several = [whole for values in trainings if len(whole := values[np.isfinite(values).all(1)]) > 1]
-        means_freedom = sum(len(values) - 1 for values in several)
-        if not means_freedom:
-            return cls()
-        settings_freedom = sum((len(values) - 1) * (values.shape[1] - 1) for values in several)
-        of_means = of_settings = 0.0
-        for values in several:
-            moved = values - values.mean(0)
-            together = moved.mean(1)
-            of_means += (together**2).sum()
-            of_settings += ((moved - together[:, None]) ** 2).sum()
-        return cls(
-            of_means / means_freedom,
-            means_freedom,
-            of_settings / max(settings_freedom, 1),
-            settings_freedom,
-            sum((len(values) - 1) / values.shape[1] for values in several) / means_freedom,
-        )
-
-    def error(self, sums: Iterable[tuple[Sequence[float], int]]) -> TrainingError:
+    def error(self, trainings: Iterable[tuple[int, Mapping[int, float]]]) -> TrainingError:
         """Return the error of a sum of means.
 
         Args:
-            sums: a part for each agent: the weights of its settings, and over how many trainings each is a mean. Parts
-                are independent.
-
-        Example:
-            >>> scatter = TrainingScatter.of([np.array([[1.0, 2.0], [3.0, 4.0]])])
-            >>> scatter.error([([1.0], 1)]).variance, scatter.error([([1.0, -1.0], 1)]).variance
-            (2.0, 0.0)
+            trainings: for each that takes part the number of its agent, and the weights of the settings at which it
+                was measured, by their numbers.
         """
-        together = own = 0.0
-        for weights, trainings in sums:
-            together += sum(weights) ** 2 / trainings
-            own += sum(weight**2 for weight in weights) / trainings
-        if self.of_means <= self.share * self.of_settings:  # nothing moves the settings together
-            return _summed((own * self.of_settings, self.settings_freedom))
-        return _summed(
-            (together * self.of_means, self.means_freedom),
-            ((own - self.share * together) * self.of_settings, self.settings_freedom),
-        )
+        variance, freedom = 0.0, float("inf")
+        for agent, weights in trainings:
+            of_training, known_with = self._variance(agent, dict(sorted(weights.items())))
+            if known_with:
+                # Parts are learnt from the same trainings: together they are known no better than the worst.
+                variance, freedom = variance + of_training, min(freedom, known_with)
+        return TrainingError(variance, freedom) if variance else TrainingError()
+
+    def _variance(self, agent: int, weights: Mapping[int, float]) -> tuple[float, int]:
+        """Return the variance of a sum over settings of one agent from training to training, and its freedom."""
+        own, others = self._agents[agent][:, list(weights)], [n for n in self._pool() if n != agent]
+        of_sum = list(weights.values())
+        pool = [own] if agent in self.apart else [own, *(self._agents[number] for number in others)]
+        if len(of_sum) == 1:
+            pool[0] = self._agents[agent]  # at whichever setting
+        variance, freedom = _mean_square(pool, of_sum)
+        if freedom or len(of_sum) == 1:
+            return variance, freedom
+        # No agent with two trainings has so many settings. More than if all moved together it cannot be.
+        of_one, freedom = _mean_square([self._agents[number] for number in self._pool()], [1.0])
+        return of_one * sum(map(abs, of_sum)) ** 2, freedom
+
+    def _pool(self) -> list[int]:
+        return [number for number in range(len(self._agents)) if number not in self.apart]
+
+    def _freedom(self, numbers: Iterable[int]) -> int:
+        return _mean_square([self._agents[number] for number in numbers], [1.0])[1]
+
+    def _farthest_apart(self) -> int | None:
+        """Return the agent that scatters most among those pooled, if that is no chance."""
+        found: list[tuple[float, int]] = []
+        for number in self._pool():
+            (own, own_freedom), (others, others_freedom) = self.spread(number), self.pooled(number)
+            if own_freedom and others_freedom and others > 0.0:
+                found.append((float(stats.f.sf(own / others, own_freedom, others_freedom)), number))
+        p_value, number = min(found, default=(1.0, 0))
+        return number if p_value < _APART else None
 
 
-def _summed(*parts: tuple[float, float]) -> TrainingError:
-    """Add variances up, each with its degrees of freedom, as Welch and Satterthwaite do; one may count negatively."""
-    known = [(variance, freedom) for variance, freedom in parts if variance != 0.0]
-    total = sum(variance for variance, _ in known)
-    if total <= 0.0:
-        return TrainingError()
-    return TrainingError(total, total**2 / sum(variance**2 / freedom for variance, freedom in known))
+def _mean_square(agents: Iterable[Array], weights: Sequence[float]) -> tuple[float, int]:
+    """Return the variance of a weighted sum over settings from training to training, and its degrees of freedom.
+
+    Of an agent with more settings the sum is over as many of them, evenly. One weight is at any setting: the mean over
+    all of them counts.
+    """
+    squares, freedom = 0.0, 0
+    for values in agents:
+        settings = values.shape[1]
+        if len(weights) == 1:
+            sums = [column * weights[0] for column in values.T]
+        elif settings >= len(weights):
+            sums = [values[:, np.linspace(0, settings - 1, len(weights)).round().astype(int)] @ np.array(weights)]
+        else:
+            continue
+        measured = [finite for each in sums if len(finite := each[np.isfinite(each)]) > 1]
+        if measured:
+            # Settings of one training go together: they are not so many independent ones.
+            of_agent = max(len(each) - 1 for each in measured)
+            squares += of_agent * float(np.mean([each.var(ddof=1) for each in measured]))
+            freedom += of_agent
+    return (squares / freedom if freedom else 0.0), freedom

@@ -81,16 +81,16 @@ def missing(finding: Finding) -> str:
 
 
 def over(finding: Finding) -> str:
-    """Say what the intervals are over: maps, and training seeds where it is known how these differ."""
+    """Say what the intervals are over: maps, and trainings where it is known how these differ."""
     expectations = [one.expectation for one in finding.judged]
     fewest, most = finding.measured.num_seeds(expectations)
     if not most:
         return ""
     units = f"{finding.measured.num_units(expectations)} {finding.measured.unit}"
     if not finding.measured.speaks_of_trainings(expectations):
-        return f"{units} alone: one training seed"
-    seeds = f"{most} training seed{'s' if most > 1 else ''}"
-    return f"{units} and {seeds}" + (f", of some agents {fewest}" if fewest < most else "")
+        return f"{units} alone: one training of each agent" if most == 1 else f"{units} alone"
+    trainings = f"{most}" if fewest == most else f"{fewest} to {most}"
+    return f"{units} and other trainings: {trainings} of each agent here"
 
 
 def as_table(findings: Sequence[Finding]) -> pd.DataFrame:

@@ -1,7 +1,7 @@
 """What a claim about means is worth: it holds, it does not, or the intervals cannot tell.
 
 A claim is made of expectations, such as "these rows collide less than those". Each is a weighted sum of means over the
-same maps, whose interval crosses maps and training seeds (:func:`rcdsac_trl.report.statistics.contrast`).
+same maps, whose interval crosses maps and trainings (:func:`rcdsac_trl.report.statistics.contrast`).
 
 - *Less* holds if the whole interval lies below nothing. It does not hold if the whole interval lies above what would be
   called comparable. Otherwise nobody can tell. *More* is its mirror image.
@@ -10,7 +10,6 @@ same maps, whose interval crosses maps and training seeds (:func:`rcdsac_trl.rep
   1 - (1 - c) / k, since one of many seems to fail by chance. A claim about *any* is its mirror image.
 """
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -20,8 +19,7 @@ import numpy as np
 
 from rcdsac_trl.report.read import METRIC_NAMES
 from rcdsac_trl.report.statistics import CONFIDENCE, Array, Interval, Term, contrast, of_these_agents
-from rcdsac_trl.report.training_errors import Training, training_of
-from rcdsac_trl.report.training_scatter import TrainingError, TrainingScatter
+from rcdsac_trl.report.training_scatter import TrainingError
 
 COMPARABLE = 0.05
 """Share of a mean that counts as no difference. The paper calls 0.95 and 0.91 collisions comparable, which is 4 %, and
@@ -78,6 +76,13 @@ class Expectation:
     def cells(self) -> list[Cell]:
         """All cells it needs, each once."""
         return list(dict.fromkeys(cell for group in self.groups for cell in group.cells))
+
+
+def _weighted(expectation: Expectation) -> Iterator[tuple[float, Cell]]:
+    """Yield the cells of a sum, each with its weight."""
+    for group, weight in zip(expectation.groups, expectation.weights, strict=True):
+        for cell in group.cells:
+            yield weight / len(group.cells), cell
 
 
 def than(first: Group, expected: Expected, second: Group, metric: str = "collisions") -> Expectation:
@@ -158,8 +163,8 @@ class Measured:
         paper: a metric under a cell by the paper; NaN if it has none.
         unit: what the second axis is, in the plural: ``"maps"``.
         names: what metrics are called.
-        scatter: how far trainings lie apart, under a sensor and in a metric; None: nothing but the cells of a claim
-            says so.
+        error: what other trainings would change in a weighted sum of cells' means in a metric, None if nobody knows
+            how they differ; without it the cells of a claim alone say so.
     """
 
     def __init__(
@@ -168,14 +173,14 @@ class Measured:
         paper: Callable[[Cell, str], float],
         unit: str = "maps",
         names: Mapping[str, str] = METRIC_NAMES,
-        scatter: Callable[[str, str], TrainingScatter] | None = None,
+        error: Callable[[Sequence[tuple[float, Cell]], str], TrainingError | None] | None = None,
     ) -> None:
         self._values = values
         self._paper = paper
         self._known: dict[tuple[Cell, str], Array | None] = {}
         self.unit = unit
         self.names = names
-        self._scatter = scatter
+        self._error = error
 
     def of_agents(self) -> "Measured":
         """Return the same for these very agents, of which training seeds say nothing of other trainings."""
@@ -187,18 +192,8 @@ class Measured:
         return Measured(together, self._paper, self.unit, self.names)
 
     def error(self, expectation: Expectation) -> TrainingError | None:
-        """Return what other trainings would change in the sum of an expectation; None: its own cells say so."""
-        if self._scatter is None:
-            return None
-        parts: dict[str, defaultdict[tuple[Training, int], list[float]]] = {}
-        for weight, cell, values in self._weighted(expectation):
-            of_sensor = parts.setdefault(cell.sensor, defaultdict(list))
-            of_sensor[training_of(cell.agent, cell.beta, cell.sensor), len(values)].append(weight)
-        error = TrainingError()
-        for sensor, of_sensor in parts.items():
-            scatter = self._scatter(sensor, expectation.metric)
-            error += scatter.error((weights, seeds) for (_, seeds), weights in of_sensor.items())
-        return error
+        """Return what other trainings would change in the sum of an expectation; None if nobody knows."""
+        return None if self._error is None else self._error(list(_weighted(expectation)), expectation.metric)
 
     def values(self, cell: Cell, metric: str) -> Array | None:
         """Return what was measured under a cell, None if nothing was."""
@@ -222,18 +217,14 @@ class Measured:
 
     def interval(self, expectation: Expectation, confidence: float) -> Interval:
         """Return the sum of an expectation, all of whose cells are there, with its interval."""
-        terms = [
-            Term(weight, values, str(training_of(cell.agent, cell.beta, cell.sensor)))
-            for weight, cell, values in self._weighted(expectation)
-        ]
-        return contrast(terms, confidence, self.error(expectation))
-
-    def _weighted(self, expectation: Expectation) -> Iterator[tuple[float, Cell, Array]]:
-        for group, weight in zip(expectation.groups, expectation.weights, strict=True):
-            for cell in group.cells:
-                values = self.values(cell, expectation.metric)
-                assert values is not None
-                yield weight / len(group.cells), cell, values
+        terms = []
+        for weight, cell in _weighted(expectation):
+            values = self.values(cell, expectation.metric)
+            assert values is not None
+            terms.append(Term(weight, values, f"{cell.agent} {cell.sensor}"))
+        # Where it is not known of one sensor how trainings differ, half of their error would mislead.
+        unknown = None if self._error is None else TrainingError()
+        return contrast(terms, confidence, self.error(expectation) or unknown)
 
     def num_seeds(self, expectations: Sequence[Expectation]) -> tuple[int, int]:
         """Return the fewest and the most training seeds of what was measured; 0 if nothing was."""
@@ -242,10 +233,9 @@ class Measured:
 
     def speaks_of_trainings(self, expectations: Sequence[Expectation]) -> bool:
         """Say whether intervals are over other trainings, too."""
-        if self._scatter is None:
+        if self._error is None:
             return self.num_seeds(expectations)[1] > 1
-        cells = {(cell.sensor, one.metric) for one in expectations for cell in one.cells}
-        return any(self._scatter(*of).is_known for of in cells)
+        return any(self.error(one) is not None for one in expectations)
 
     def num_units(self, expectations: Sequence[Expectation]) -> int:
         """Return how many maps, or other units, were driven; 0 if nothing was measured."""

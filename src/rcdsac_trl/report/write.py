@@ -33,6 +33,7 @@ def write_report(results: Results, out: Path) -> None:
         "summary": results.summary,
         "comparisons": results.comparisons,
         "trends": results.trends,
+        "trainings": results.trainings,
         "averages": results.averages,
         "adaptive": results.adaptive,
         "collision_summary": results.causes,
