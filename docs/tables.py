@@ -3,15 +3,22 @@
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
 ``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>`` takes these rows
 of it alone. A table of seeds names agents of ``results/`` that were trained again, and finds the other trainings in
-``results/seed-*/``. The comment of a table of the office course names the folder of what ``course`` wrote, that of a
-table of disturbances the files of ``docs/disturbances.py``, in their order. The table of an accelerator is what
-``benchmarks/accelerator.py`` wrote::
+``results/seed-*/``. Tables beside the paper name a sensor, and are over all trainings of its rows in ``results/``: the
+means, the claims with their verdicts, and differences from agents or baselines. The comment of a table of the office
+course names the folder of what ``course`` wrote, that of a table of disturbances the files of
+``docs/disturbances.py``, in their order. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
 
     <!-- agents: sac-narrow pursuit-narrow -->
     | agent | collisions | ..
     <!-- agents: end -->
     <!-- seeds: sac-narrow -->
     <!-- seeds: end -->
+    <!-- paper: narrow -->
+    <!-- paper: end -->
+    <!-- claims: narrow -->
+    <!-- claims: end -->
+    <!-- differences: narrow rcdsac_cvar rcdsac_pow from sac mppi -->
+    <!-- differences: end -->
     <!-- course: results/course -->
     <!-- course: end -->
     <!-- disturbances: mppi -->
@@ -30,10 +37,16 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rcdsac_trl.report.card import measured_values
+from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_table import course_table
 from rcdsac_trl.report.findings import labels
 from rcdsac_trl.report.read import Episodes, read_episodes
-from rcdsac_trl.report.statistics import compare
+from rcdsac_trl.report.rows import condition_label, paper_table, row_label
+from rcdsac_trl.report.statistics import Term, compare, contrast
+from rcdsac_trl.report.table import comparison
+from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.verdict_words import numbers, of_agents
+from rcdsac_trl.report.verdicts import Finding
 
 Floats = NDArray[np.float64]
 
@@ -52,6 +65,9 @@ def renewed(text: str) -> str:
     tables: Mapping[str, Callable[[list[str]], str]] = {
         "agents": table_of,
         "seeds": lambda names: table_of_seeds(_trainings(names)),
+        "paper": lambda sensor: table_beside_the_paper(_paper(), *sensor),
+        "claims": lambda sensors: table_of_claims(_claims(), " ".join(sensors)),
+        "differences": lambda names: table_of_differences(_paper(), names),
         "course": lambda folders: table_of_course(*(ROOT / folder for folder in folders)),
         "disturbances": lambda names: table_of_disturbances(_driven(names)),
     }
@@ -88,8 +104,12 @@ def _conditions(name: str) -> list[Mapping[str, Any]]:
 
 def _trainings(names: Sequence[str]) -> list[Episodes]:
     """Return what all trainings of each of some agents drove."""
-    folders = [[ROOT / "results" / name, *sorted((ROOT / "results").glob(f"seed-*/{name}"))] for name in names]
-    return [read_episodes(of_agent) for of_agent in folders]
+    return [read_episodes(_folders(name)) for name in names]
+
+
+def _folders(name: str) -> list[Path]:
+    """Return the folders of all trainings of an agent, or of a baseline."""
+    return [ROOT / "results" / name, *sorted((ROOT / "results").glob(f"seed-*/{name}"))]
 
 
 def table_of_seeds(agents: Sequence[Episodes]) -> str:
@@ -116,6 +136,64 @@ def table_of_seeds(agents: Sequence[Episodes]) -> str:
     collisions, reward = np.sqrt(np.mean(variances, axis=0))
     apart = ["standard deviation, one training to another", *([""] * len(seeds)), f"{collisions:.2f} / {reward:.0f}"]
     return _markdown(headings, [*rows, apart])
+
+
+@cache
+def _paper() -> Episodes:
+    """Return what all trainings of the paper's rows drove, with both sensors, and MPPI."""
+    agents = paper_table()[["agent", "beta"]].itertuples(index=False)
+    names = {name for agent, beta in agents for name in (agent, f"{agent}_{beta:g}")} | {"mppi"}
+    folders = sorted((ROOT / "results").glob("*-*"))
+    chosen = [folder.name for folder in folders if folder.name.rpartition("-")[0] in names]
+    return read_episodes([training for name in chosen for training in _folders(name)])
+
+
+@cache
+def _claims() -> list[Finding]:
+    return judged_claims(_paper())
+
+
+def table_beside_the_paper(episodes: Episodes, sensor: str) -> str:
+    """Return collisions and rewards of a sensor beside the paper's, Markdown: a row an agent and setting."""
+    table = comparison(episodes)
+    told = [column for column in table.columns if column[0] in ("", sensor)]
+    rows = table.loc[table[sensor, "collisions"] != "", told]
+    return _markdown([str(name) for _, name in told], rows.to_numpy().tolist())
+
+
+def table_of_claims(findings: Sequence[Finding], sensor: str) -> str:
+    """Return the claims about a sensor, Markdown: verdicts over other trainings and of these agents, and numbers."""
+    rows = [
+        [finding.claim.says, f"**{finding.verdict.value}**", of_agents(finding), numbers(finding)]
+        for finding in findings
+        if finding.claim.sensor == sensor
+    ]
+    return _markdown(["claim", "verdict", "of these agents alone", "numbers"], rows)
+
+
+def table_of_differences(episodes: Episodes, names: Sequence[str]) -> str:
+    """Return differences of means with their intervals over maps and trainings, Markdown: a row a condition.
+
+    Args:
+        episodes: of all of them.
+        names: the sensor, agents, ``from``, and what they are compared with.
+    """
+    sensor, *agents = names[: names.index("from")]
+    errors, conditions = TrainingErrors(episodes), episodes.conditions[episodes.conditions["sensor"] == sensor]
+    against = [conditions[conditions["agent"] == name].iloc[0] for name in names[names.index("from") + 1 :]]
+    rows = []
+    for agent in agents:
+        for _, condition in conditions[conditions["agent"] == agent].iterrows():
+            cells = [condition_label(agent, sensor, condition["beta"], condition["collision_weight"], None)]
+            for other in against:
+                for metric, form in (("collisions", ".2f"), ("reward", ".0f")):
+                    sides = ((1.0, condition), (-1.0, other))
+                    terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]
+                    found = contrast(terms, error=errors.between(condition, other, metric))
+                    cells.append(f"{found.value:{form}} [{found.low:{form}}, {found.high:{form}}]")
+            rows.append(cells)
+    headings = [f"{metric}, from {row_label(each['agent'])}" for each in against for metric in ("collisions", "reward")]
+    return _markdown(["agent", *headings], rows)
 
 
 def table_of_course(folder: Path) -> str:

@@ -148,6 +148,29 @@ def test_the_table_of_seeds_is_what_all_trainings_drove() -> None:
     ]
 
 
+def test_tables_beside_the_paper_are_over_all_trainings() -> None:
+    """SAC's two trainings have 0.1 and 0.3 on every map, MPPI 0.5: t of one degree of freedom is 12.7."""
+    tables = runpy.run_path(str(ROOT / "docs" / "tables.py"))
+    driven = [("sac", 0, 0.1), ("sac", 1, 0.3), ("mppi", 0, 0.5)]
+    rows = [(agent, seed, map_, collisions, 500.0) for agent, seed, collisions in driven for map_ in (0, 1)]
+    told = {"sensor": "narrow", "beta": None, "collision_weight": None, "beta_controller": None, "measure": None}
+    table = pd.DataFrame(rows, columns=["agent", "train_seed", "map", "collisions", "reward"]).assign(
+        **told, helped="", weights=None, episode=0
+    )
+    table = table.assign(trained=table["agent"] == "sac").astype({"beta": float, "collision_weight": float})
+    episodes = Episodes(table, {"num_maps": 2, "num_episodes": 1}, pd.DataFrame())
+    assert tables["table_of_differences"](episodes, ["narrow", "sac", "from", "mppi"]).splitlines() == [
+        "| agent | collisions, from MPPI | reward, from MPPI |",
+        "|---|---|---|",
+        "| SAC | -0.30 [-1.56, 0.96] | 0 [0, 0] |",
+    ]
+    beside = tables["table_beside_the_paper"](episodes, "narrow").splitlines()
+    assert beside[0].startswith(
+        "| agent | risk measure | β or weight | collisions | collisions, 95 % | collisions, paper |"
+    )
+    assert beside[2].startswith("| SAC |  |  | 0.20 ± 0.10 | [0.00, 1.46] | 1.76 ± 2.02 |")
+
+
 def test_the_table_of_the_course_is_what_was_driven(tmp_path: Path) -> None:
     table = runpy.run_path(str(ROOT / "docs" / "tables.py"))["table_of_course"]
     assert table(tmp_path) == "Not driven yet.\n"
