@@ -186,6 +186,9 @@ def table_of_differences(episodes: Episodes, names: Sequence[str]) -> str:
         for _, condition in conditions[conditions["agent"] == agent].iterrows():
             cells = [condition_label(agent, sensor, condition["beta"], condition["collision_weight"], None)]
             for other in against:
+                if other.equals(condition):
+                    cells += ["", ""]
+                    continue
                 for metric, form in (("collisions", ".2f"), ("reward", ".0f")):
                     sides = ((1.0, condition), (-1.0, other))
                     terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]

@@ -182,6 +182,7 @@ def test_trainings_of_all_agents_are_pooled_and_each_of_dsacs_is_one() -> None:
     averse, bold = of["dsac_cvar", 0.25], of["dsac_cvar", 0.75]
     assert not errors.same(averse, bold)
     assert errors.same(of["rcdsac_cvar", 0.25], of["rcdsac_cvar", 1.0])
+    assert errors.between(averse, averse, "collisions") == TrainingError()
     between = errors.between(averse, bold, "collisions")
     assert (between.variance, between.freedom) == (pytest.approx(POOLED * (1 / 2 + 1)), 2)
     table = errors.trainings(["collisions"]).set_index(["agent", "beta"])

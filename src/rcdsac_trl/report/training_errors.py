@@ -110,7 +110,7 @@ class TrainingErrors:
 
     @staticmethod
     def _of_sensor(table: _Table, terms: Terms) -> TrainingError:
-        weights: defaultdict[tuple[int, int], dict[int, float]] = defaultdict(dict)
+        weights: defaultdict[tuple[int, int], defaultdict[int, float]] = defaultdict(lambda: defaultdict(float))
         places = {
             number: (recipe, place) for recipe, of in enumerate(table.settings) for place, number in enumerate(of)
         }
@@ -120,7 +120,7 @@ class TrainingErrors:
             recipe, place = places[condition.name]
             measured = np.flatnonzero(np.isfinite(table.values[recipe][:, place])).tolist()
             for training in measured:
-                weights[recipe, training][place] = weight / len(measured)
+                weights[recipe, training][place] += weight / len(measured)
         return table.scatter.error((recipe, of_training) for (recipe, _), of_training in weights.items())
 
     def _table(self, sensor: str, metric: str, statistic: Statistic) -> _Table:
