@@ -1,11 +1,11 @@
 """Write the tables of README.md and the pages of docs/ anew that follow from files: ``make tables``.
 
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
-``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>`` takes these rows
-of it alone. A table of seeds names agents of ``results/`` that were trained again, and finds the other trainings in
-``results/seed-*/``. Tables beside the paper name a sensor, and are over all trainings of its rows in ``results/``: the
-means, the claims with their verdicts, and differences from agents or baselines. The comment of a table of the office
-course names the folder of what ``course`` wrote, that of a table of disturbances the files of
+``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>``, of RCWR
+weights, takes these rows of it alone. A table of seeds names agents of ``results/`` that were trained again, and finds
+the other trainings in ``results/seed-*/``. Tables beside the paper name a sensor, and are over all trainings of its
+rows in ``results/``: the means, the claims with their verdicts, and differences from agents or baselines. The comment
+of a table of the office course names the folder of what ``course`` wrote, that of a table of disturbances the files of
 ``docs/disturbances.py``, in their order. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
 
     <!-- agents: sac-narrow pursuit-narrow -->
@@ -88,7 +88,7 @@ def table_of(names: list[str]) -> str:
     """Return the table of some agents and baselines, Markdown: a row a condition.
 
     Args:
-        names: of each, with ``:`` and betas behind it where not all are to be shown.
+        names: of each, with ``:`` and betas, or weights, behind it where not all are to be shown.
     """
     return _markdown(_HEADINGS, [_cells(condition) for name in names for condition in _conditions(name)])
 
@@ -98,8 +98,11 @@ def _conditions(name: str) -> list[Mapping[str, Any]]:
     conditions: list[Mapping[str, Any]] = measured_of(whose)["conditions"]
     if not chosen:
         return conditions
-    by_beta = {condition["beta"]: condition for condition in conditions}
-    return [by_beta[float(beta)] for beta in chosen.split(",")]
+    by_setting = {
+        condition["collision_weight"] if condition["beta"] is None else condition["beta"]: condition
+        for condition in conditions
+    }
+    return [by_setting[float(setting)] for setting in chosen.split(",")]
 
 
 def _trainings(names: Sequence[str]) -> list[Episodes]:
