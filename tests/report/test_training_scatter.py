@@ -189,6 +189,7 @@ def test_trainings_of_all_agents_are_pooled_and_each_of_dsacs_is_one() -> None:
     assert table["trainings"].tolist() == [2, 2, 1, 1]
     assert table.loc["rcdsac_cvar", "sd"].item() == pytest.approx(0.02**0.5)
     assert table.loc["rcdsac_cvar", "sd_others"].item() == pytest.approx(0.005**0.5)
+    assert table["sd"].isna().tolist() == [False, False, True, True]
 
 
 def test_settings_that_other_trainings_drove_do_not_cancel() -> None:

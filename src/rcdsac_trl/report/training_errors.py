@@ -93,7 +93,7 @@ class TrainingErrors:
             for metric in metrics:
                 table = self._table(sensor, metric, mean)
                 for number, (agent, _, beta) in enumerate(table.recipes):
-                    (own, freedom), (others, _) = table.scatter.spread(number), table.scatter.pooled(number)
+                    own, others = table.scatter.spread(number), table.scatter.pooled(number)
                     rows.append(
                         {
                             "agent": agent,
@@ -101,8 +101,8 @@ class TrainingErrors:
                             "beta": beta,
                             "trainings": len(table.seeds[number]),
                             "metric": metric,
-                            "sd": own**0.5 if freedom else math.nan,
-                            "sd_others": others**0.5,
+                            "sd": _deviation(*own),
+                            "sd_others": _deviation(*others),
                             "apart": number in table.scatter.apart,
                         }
                     )
@@ -148,3 +148,8 @@ class TrainingErrors:
         agent, sensor = condition["agent"], condition["sensor"]
         apart = not has_dial(agent) or (agent, sensor) in self._trained_apart
         return agent, sensor, condition["beta"] if apart else None
+
+
+def _deviation(variance: float, freedom: int) -> float:
+    """Return a standard deviation, NaN where nothing tells it."""
+    return variance**0.5 if freedom else math.nan
