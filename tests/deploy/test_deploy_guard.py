@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from motors import LateMotors, driven
 
@@ -14,6 +14,7 @@ from rcdsac_trl.deploy import Guard, PathFollower, Sectors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import clip_command
 from rcdsac_trl.robot.compiled_guard import CompiledGuard
+from rcdsac_trl.robot.guard import _BESIDE_M
 from rcdsac_trl.robot.latency import Ahead, Latency
 from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.world.sim.lidar import sector_distances
@@ -134,8 +135,9 @@ def test_it_backs_where_it_has_been_and_nowhere_else() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
+@example(302)  # it drives on within 4 mm of what it never saw, and backs 1 mm beside its way
 def test_who_sees_ahead_alone_never_backs_into_what_stands(seed: int) -> None:
-    """Whatever is commanded; what it never saw beside it, it may touch as it drives on."""
+    """Whatever is commanded. What it never saw beside it, it may touch as it drives on, and graze where it has been."""
     rng = np.random.default_rng(seed)
     circles = np.column_stack([rng.uniform(-2, 2, (25, 2)), rng.uniform(0.02, 0.2, 25)])
     guard = Guard()
@@ -155,8 +157,8 @@ def test_who_sees_ahead_alone_never_backs_into_what_stands(seed: int) -> None:
             v, omega = clip_command(*command, v, omega)
             yaw += omega * 0.02
             x, y = x + v * 0.02 * math.cos(yaw), y + v * 0.02 * math.sin(yaw)
-            if free_distance(x, y, NO_SEGMENTS, circles) < guard.radius_m:
-                assert v > 0.0
+            if (distance_m := free_distance(x, y, NO_SEGMENTS, circles)) < guard.radius_m:
+                assert v > 0.0 or distance_m >= guard.radius_m - _BESIDE_M
                 return
         if v > 0.0 and math.dist(trail[-1], (x, y)) > 0.02:
             trail.append((x, y))
