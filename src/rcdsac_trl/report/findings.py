@@ -145,11 +145,8 @@ def adaptive(episodes: Episodes) -> pd.DataFrame:
             for _, condition in turned.iterrows():
                 best = int(np.argmin(means) if metric in _BETTER_DOWN else np.argmax(means))
                 values = episodes.of(condition, metric)
-                sides, error = (
-                    (values, episodes.of(fixed[best], metric)),
-                    errors.between(condition, fixed[best], metric),
-                )
-                compared = statistics.compare(*sides, same_agents=True, error=error)
+                error = errors.between(condition, fixed[best], metric)
+                compared = statistics.compare(values, episodes.of(fixed[best], metric), same_agents=True, error=error)
                 found.append(
                     {
                         "agent": agent,

@@ -166,11 +166,14 @@ class Episodes:
     def of(self, condition: pd.Series, metric: str) -> Array:
         """Return a metric under a condition: ``[training seeds, maps, episodes]``."""
         shape = (-1, self.protocol["num_maps"], self.protocol["num_episodes"])
-        return self._by_condition[_key(condition[list(CONDITION)])][metric].to_numpy(np.float64).reshape(shape)
+        return self._rows(condition)[metric].to_numpy(np.float64).reshape(shape)
 
     def seeds(self, condition: pd.Series) -> list[int]:
         """Return the training seeds under a condition, in the order of :meth:`of`."""
-        return self._by_condition[_key(condition[list(CONDITION)])]["train_seed"].unique().tolist()
+        return self._rows(condition)["train_seed"].unique().tolist()
+
+    def _rows(self, condition: pd.Series) -> pd.DataFrame:
+        return self._by_condition[_key(condition[list(CONDITION)])]
 
     @cached_property
     def _by_condition(self) -> dict[tuple[Any, ...], pd.DataFrame]:

@@ -343,8 +343,7 @@ def _trainings(results: Results) -> list[Part]:
     shown: list[Part] = []
     for metric, rows in results.trainings.groupby("metric", sort=False):
         names = [
-            condition_label(agent, sensor, nothing if beta is None else beta, nothing, None, 2)
-            for nothing in (float("nan"),)
+            condition_label(agent, sensor, beta, float("nan"), None, 2)
             for agent, sensor, beta in rows[["agent", "sensor", "beta"]].itertuples(index=False)
         ]
         columns = {

@@ -80,6 +80,7 @@ class TrainingScatter:
 
     def __init__(self, agents: Sequence[Array]) -> None:
         self._agents = list(agents)
+        self._spreads = [_spread(values, [1.0]) for values in agents]
         self.apart: frozenset[int] = frozenset()
         while (farthest := self._farthest_apart()) is not None:
             self.apart |= {farthest}
@@ -87,15 +88,15 @@ class TrainingScatter:
     @property
     def is_known(self) -> bool:
         """Whether any agent has two trainings."""
-        return self._freedom(range(len(self._agents))) > 0
+        return any(freedom for _, freedom in self._spreads)
 
     def spread(self, agent: int) -> tuple[float, int]:
         """Return the variance of one setting from training to training by an agent's own, and its freedom."""
-        return _mean_square([self._agents[agent]], [1.0])
+        return self._spreads[agent]
 
     def pooled(self, but: int | None = None) -> tuple[float, int]:
         """Return the same of all agents that are pooled, but for one."""
-        return _mean_square([self._agents[number] for number in self._pool() if number != but], [1.0])
+        return _pooled(self._spreads[number] for number in self._pool(but))
 
     def error(self, trainings: Iterable[tuple[int, Mapping[int, float]]]) -> TrainingError:
         """Return the error of a sum of means.
@@ -114,23 +115,19 @@ class TrainingScatter:
 
     def _variance(self, agent: int, weights: Mapping[int, float]) -> tuple[float, int]:
         """Return the variance of a sum over settings of one agent from training to training, and its freedom."""
-        own, others = self._agents[agent][:, list(weights)], [n for n in self._pool() if n != agent]
         of_sum = list(weights.values())
-        pool = [own] if agent in self.apart else [own, *(self._agents[number] for number in others)]
-        if len(of_sum) == 1:
-            pool[0] = self._agents[agent]  # at whichever setting
-        variance, freedom = _mean_square(pool, of_sum)
-        if freedom or len(of_sum) == 1:
-            return variance, freedom
-        # No agent with two trainings has so many settings. More than if all moved together it cannot be.
-        of_one, freedom = _mean_square([self._agents[number] for number in self._pool()], [1.0])
+        others = [] if agent in self.apart else self._pool(agent)
+        if len(of_sum) > 1:
+            own = _spread(self._agents[agent][:, list(weights)], of_sum)
+            variance, freedom = _pooled([own, *(_spread(self._agents[number], of_sum) for number in others)])
+            if freedom:
+                return variance, freedom
+        # Also where no agent with two trainings has so many settings: more than if all moved together it cannot be.
+        of_one, freedom = _pooled(self._spreads[number] for number in (agent, *others))
         return of_one * sum(map(abs, of_sum)) ** 2, freedom
 
-    def _pool(self) -> list[int]:
-        return [number for number in range(len(self._agents)) if number not in self.apart]
-
-    def _freedom(self, numbers: Iterable[int]) -> int:
-        return _mean_square([self._agents[number] for number in numbers], [1.0])[1]
+    def _pool(self, but: int | None = None) -> list[int]:
+        return [number for number in range(len(self._agents)) if number not in self.apart and number != but]
 
     def _farthest_apart(self) -> int | None:
         """Return the agent that scatters most among those pooled, if that is no chance."""
@@ -143,25 +140,28 @@ class TrainingScatter:
         return number if p_value < _APART else None
 
 
-def _mean_square(agents: Iterable[Array], weights: Sequence[float]) -> tuple[float, int]:
+def _spread(values: Array, weights: Sequence[float]) -> tuple[float, int]:
     """Return the variance of a weighted sum over settings from training to training, and its degrees of freedom.
 
-    Of an agent with more settings the sum is over as many of them, evenly. One weight is at any setting: the mean over
-    all of them counts.
+    Of more settings the sum is over as many of them, evenly. One weight is at any setting: the mean over all of them
+    counts. Of too few settings, and of one training, nothing is known.
     """
-    squares, freedom = 0.0, 0
-    for values in agents:
-        settings = values.shape[1]
-        if len(weights) == 1:
-            sums = [column * weights[0] for column in values.T]
-        elif settings >= len(weights):
-            sums = [values[:, np.linspace(0, settings - 1, len(weights)).round().astype(int)] @ np.array(weights)]
-        else:
-            continue
-        measured = [finite for each in sums if len(finite := each[np.isfinite(each)]) > 1]
-        if measured:
-            # Settings of one training go together: they are not so many independent ones.
-            of_agent = max(len(each) - 1 for each in measured)
-            squares += of_agent * float(np.mean([each.var(ddof=1) for each in measured]))
-            freedom += of_agent
-    return (squares / freedom if freedom else 0.0), freedom
+    settings = values.shape[1]
+    if len(weights) == 1:
+        sums = list(weights[0] * values.T)
+    elif settings >= len(weights):
+        sums = [values[:, np.linspace(0, settings - 1, len(weights)).round().astype(int)] @ np.array(weights)]
+    else:
+        return 0.0, 0
+    measured = [finite for each in sums if len(finite := each[np.isfinite(each)]) > 1]
+    if not measured:
+        return 0.0, 0
+    # Settings of one training go together: they are not so many independent ones.
+    return float(np.mean([each.var(ddof=1) for each in measured])), max(len(each) - 1 for each in measured)
+
+
+def _pooled(spreads: Iterable[tuple[float, int]]) -> tuple[float, int]:
+    """Return the mean square of several variances, and its degrees of freedom."""
+    known = [(variance, freedom) for variance, freedom in spreads if freedom]
+    total = sum(freedom for _, freedom in known)
+    return (sum(variance * freedom for variance, freedom in known) / total if total else 0.0), total
