@@ -3,6 +3,7 @@
 Ray takes long to start, and each of its processes to import: what needs a cluster is slow.
 """
 
+import contextlib
 import os
 import signal
 import threading
@@ -23,7 +24,8 @@ from rcdsac_trl.errors import FaultError, UserInputError
 from rcdsac_trl.rollout.make_agent import make_actor, packed
 from rcdsac_trl.rollout.make_collector import _worker
 from rcdsac_trl.rollout.torchrl_worker import AT_REST, STEPS, WorkerCollector, beside, watch
-from rcdsac_trl.rollout.worker_processes import LocalWorker, RolloutRequest
+from rcdsac_trl.rollout.worker import EpisodeBatch
+from rcdsac_trl.rollout.worker_processes import Drive, LocalWorker, RolloutRequest
 from rcdsac_trl.storage.checkpoint_record import newest
 from rcdsac_trl.system import extras
 from rcdsac_trl.training.setup import check_training
@@ -183,6 +185,22 @@ def test_a_cluster_without_room_is_told(cluster: Any) -> None:
     makes = {f"agents {number}": partial(_worker, tiny_settings(), [number]) for number in range(3)}
     with pytest.raises(WorkerError, match=r"^the Ray cluster had no room for 3 processes within 1 s$"):
         RayWorkers(lambda cores: makes, address=None, cores=1, timeout_s=1.0)
+
+
+@pytest.mark.slow
+def test_wrong_input_that_a_process_finds_is_told_as_such(cluster: Any) -> None:
+    from rcdsac_trl.rollout.ray_workers import RayWorkers
+
+    @contextlib.contextmanager
+    def make() -> Iterator[Drive]:
+        def drive(request: RolloutRequest, before_step: Callable[[], None]) -> EpisodeBatch:
+            raise UserInputError(f"there is no map {request.map_index}: give others")
+
+        yield drive
+
+    workers = RayWorkers(lambda cores: {"agents 0": make}, address=None, cores=1, timeout_s=None)
+    with contextlib.closing(workers), pytest.raises(UserInputError, match=r"^there is no map 7: give others$"):
+        workers.ask(RolloutRequest(0, 7, b""))
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 from tensordict import TensorDictBase
 from torchrl.collectors.distributed import RayCollector
 
-from rcdsac_trl.errors import FaultError, first_line
+from rcdsac_trl.errors import FaultError, UserInputError, first_line
 from rcdsac_trl.rollout.torchrl_worker import STEPS, WorkerCollector, beside, watch
 from rcdsac_trl.rollout.worker_processes import MakeDrive, RolloutRequest
 from rcdsac_trl.system.interrupts import interruption_point
@@ -90,6 +90,7 @@ class RayWorkers:
 
         Raises:
             WorkerError: if a process dies or hangs, or its machine is lost.
+            UserInputError: if a process finds that its input is wrong.
         """
         self._waiting = beside(lambda: self._collect(request))
         hung = watch(self._waiting, self._steps, len(self._described), self._timeout_s)
@@ -98,6 +99,8 @@ class RayWorkers:
         try:
             return self._waiting.result()
         except RayError as error:
+            if isinstance(error, RayTaskError) and isinstance(error.cause, UserInputError):
+                raise error.cause from None
             raise WorkerError(self._told(error)) from error
 
     def _collect(self, request: RolloutRequest) -> TensorDictBase:

@@ -81,6 +81,10 @@ class WorkerCollector(BaseCollector):
         """Disconnect the simulations."""
         self._stack.close()
 
+    def __bool__(self) -> bool:
+        """Be true: Ray asks the truth of what has raised, and TorchRL would count batches to tell it."""
+        return True
+
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Refuse: the seed is the run's."""
         raise NotImplementedError
