@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.command import Command, Outlook
+from rcdsac_trl.deploy.policy.companions import guard_of, navigator_of
 from rcdsac_trl.deploy.policy.context import bolder, context_of, middle_of_range
 from rcdsac_trl.deploy.policy.control_periods import ControlPeriods
 from rcdsac_trl.deploy.policy.distortion import NUM_REPORTED_QUANTILES, fractions_of
@@ -32,49 +33,11 @@ from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.latency import Ahead
-from rcdsac_trl.robot.robot_settings import RobotSettings
 from rcdsac_trl.robot.sectors import Sectors
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator
     from rcdsac_trl.deploy.navigation.static_layer import Pose
-
-
-def _guard_of(robot: RobotSettings, guard: Guard | Literal["robot"] | None) -> Guard | None:
-    """Return the guard of a robot's policy.
-
-    Raises:
-        UserInputError: if the one that was given is another robot's.
-    """
-    if guard == "robot":
-        return Guard.of(robot)
-    if not isinstance(guard, Guard | None):
-        raise UserInputError(f"guard={guard!r} is none: give Guard.of(robot), None to drive without, or leave it out")
-    if guard is not None and guard.robot != robot:
-        raise UserInputError(
-            f"the guard has the limits of robot={guard.robot.name}, and this agent drives robot={robot.name}: give "
-            "Guard.of(policy.robot, ..), or leave it out"
-        )
-    return guard
-
-
-def _navigator_of(robot: RobotSettings, navigator: "Navigator | None") -> "Navigator | None":
-    """Return the navigator of a robot's policy.
-
-    Raises:
-        UserInputError: if the one that was given is none, or another robot's.
-    """
-    if navigator is None:
-        return None
-    of = getattr(navigator, "robot", None)  # its class takes numba to import
-    if not isinstance(of, RobotSettings):
-        raise UserInputError(f"navigator={navigator!r} is none: give Navigator(NavigatorSettings(), policy.robot)")
-    if of != robot:
-        raise UserInputError(
-            f"the navigator is of robot={of.name}, and this agent drives robot={robot.name}: give "
-            "Navigator(NavigatorSettings(), policy.robot)"
-        )
-    return navigator
 
 
 class Policy:
@@ -123,7 +86,7 @@ class Policy:
         self.measured = weights.measured
         self.robot = self.config.robot
         self._observer = RobotObserver(self.config, latency_s)
-        self.guard = _guard_of(self.robot, guard)
+        self.guard = guard_of(self.robot, guard)
         if not isinstance(limits, InputLimits):
             raise UserInputError(f"limits={limits!r} are none: give InputLimits(..), or leave them out")
         self.limits = limits
@@ -169,7 +132,7 @@ class Policy:
 
     @navigator.setter
     def navigator(self, navigator: "Navigator | None") -> None:
-        self._navigator = _navigator_of(self.robot, navigator)
+        self._navigator = navigator_of(self.robot, navigator)
 
     @property
     def acting(self) -> ActingSettings:
@@ -447,28 +410,42 @@ class Policy:
     ) -> Command:
         outlook = self._told
         assert outlook is not None
-        (v, omega), been = outlook.wanted, None
-        told = ["it stands still, so beta turns to its boldest until it gets on"] if self._turned_to is not None else []
-        if self._advice is not None:
-            been = self._advice.been
-            if self._advice.instead is not None:
-                v, omega = self._advice.instead
-                told = ["it stood still and backs off; the agent drives on then"]
-        if self.guard is not None:
-            wish = v, omega
-            reach_m = self.guard.reach_m(abs(v), ahead)
-            known = self._known(sectors, on_map, reach_m)
-            v, omega, reason = self.guard.limit(*wish, known, measured, been, ahead)
-            if on_map is not None and reason:
-                unmapped = self._known(sectors, None, reach_m)
-                if not self.guard.limit(*wish, unmapped, measured, been, ahead)[2]:
-                    reason += " around what the map shows"
-            if reason is not None:
-                told.insert(0, f"limited by {reason}; it ends when the cause does")
+        wish, reasons = self._wish(outlook)
+        driven, limit = self._limited(wish, sectors, measured, ahead, on_map)
+        if limit is not None:
+            reasons.insert(0, f"limited by {limit}; it ends when the cause does")
         # Networks are told what the robot was told: the limits are part of the world.
-        self._observer.note((v, omega), self._periods.time_s)
+        self._observer.note(driven, self._periods.time_s)
         quantiles, value, raw = outlook.quantiles, outlook.value, outlook.raw_quantiles
-        return Command(v, omega, False, "; ".join(told) or None, outlook.wanted, quantiles, value, fresh, forgot, raw)
+        return Command(*driven, False, "; ".join(reasons) or None, outlook.wanted, quantiles, value, fresh, forgot, raw)
+
+    def _wish(self, outlook: Outlook) -> tuple[tuple[float, float], list[str]]:
+        """Return the velocities before the guard, and in what the navigator has a hand, sentence by sentence."""
+        if self._advice is not None and self._advice.instead is not None:
+            return self._advice.instead, ["it stood still and backs off; the agent drives on then"]
+        if self._turned_to is not None:
+            return outlook.wanted, ["it stands still, so beta turns to its boldest until it gets on"]
+        return outlook.wanted, []
+
+    def _limited(
+        self,
+        wish: tuple[float, float],
+        sectors: Sectors,
+        measured: tuple[float, float],
+        ahead: Ahead,
+        on_map: "Pose | None",
+    ) -> tuple[tuple[float, float], str | None]:
+        """Return the velocities that the guard allows, and what limits them; None where nothing does."""
+        if self.guard is None:
+            return wish, None
+        been = None if self._advice is None else self._advice.been
+        reach_m = self.guard.reach_m(abs(wish[0]), ahead)
+        v, omega, limit = self.guard.limit(*wish, self._known(sectors, on_map, reach_m), measured, been, ahead)
+        if on_map is not None and limit:
+            unmapped = self._known(sectors, None, reach_m)
+            if not self.guard.limit(*wish, unmapped, measured, been, ahead)[2]:
+                limit += " around what the map shows"
+        return (v, omega), limit
 
     def _known(self, sectors: Sectors, on_map: "Pose | None", reach_m: float) -> Sectors:
         """Return what the stop zone minds: what is sensed, and what the navigator knows besides."""
