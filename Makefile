@@ -19,10 +19,10 @@ help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F '|' '{ printf "%-16s %s\n", $$1, $$2 }'
 
 train: install ## train a risk-conditioned agent: two cores, about 25 minutes
-	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow
+	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_cvar
 
 smoke: install ## rehearse the whole training in a minute or two; it learns nothing
-	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_pow preset=smoke
+	$(BIN)/python -m rcdsac_trl.train +algo=rcdsac_cvar preset=smoke
 
 play: install ## drive a shipped agent on a page in your browser; Ctrl-C ends it
 	$(BIN)/python -m rcdsac_trl.play
