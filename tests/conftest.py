@@ -31,9 +31,9 @@ remember_compositions()
 # is, and another worker that needs it meanwhile would compile it, too: the next files only compose configs.
 LONGEST = (
     "test_trainer",
-    "test_config",
     "test_command_line",
     "test_verbs",
+    "test_config",
     "test_play_browser",
     "test_cli",
     "test_sweep",
@@ -49,6 +49,7 @@ LONGEST = (
     "test_publish",
     "test_optuna_search",
     "test_benchmarks",
+    "test_dead_keys",
     "test_play_server",
     "test_evaluation_pool",
     "test_nav2_stack",
