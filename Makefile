@@ -53,7 +53,7 @@ check: setup ## look for mistakes of style and types
 notebooks: setup ## run the notebooks anew, in place
 	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
-tables: setup ## write the tables of agents in README.md and docs/ anew, from weights/ and results/
+tables: setup ## write the tables of README.md and docs/ and the cards of weights/ anew, from weights/ and results/
 	$(BIN)/python docs/tables.py
 
 docs: setup ## build the documentation as a site: build/docs/html/index.html

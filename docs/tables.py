@@ -1,4 +1,4 @@
-"""Write the tables of README.md and the pages of docs/ anew that follow from files: ``make tables``.
+"""Write anew what follows from files: tables of README.md and docs/, and the cards of weights/: ``make tables``.
 
 A table of agents stands between two comments, of which the first names whose it is, in their order: agents of
 ``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>``, of RCWR
@@ -36,6 +36,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from rcdsac_trl.deploy.policy.weights import card_of, read_weights
 from rcdsac_trl.report.card import measured_values
 from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_table import course_table
@@ -52,6 +53,7 @@ Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+CARDS = sorted((ROOT / "weights").glob("*/README.md"))
 _ACCELERATOR = re.compile(r"(<!-- accelerator: begin -->\n).*?(<!-- accelerator: end -->)", re.S)
 _COURSE_HEADINGS = (
     *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
@@ -302,9 +304,18 @@ def accelerator_table(values: Mapping[str, Any] | None) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in (("part", "", ""), ("---",) * 3, *rows))
 
 
+def _renewed_card(card: Path) -> str:
+    """Return the card of a shipped agent, as ``publish`` would write it today."""
+    weights = read_weights(card.parent)
+    return card_of(weights, weights.measured)
+
+
 if __name__ == "__main__":
-    for document in DOCUMENTS:
-        text = document.read_text(encoding="utf-8")
-        if (new := renewed(text)) != text:
-            document.write_text(new, encoding="utf-8")
-            print(f"{document.relative_to(ROOT)}: written anew")
+    for documents, write in (
+        (DOCUMENTS, lambda page: renewed(page.read_text(encoding="utf-8"))),
+        (CARDS, _renewed_card),
+    ):
+        for document in documents:
+            if (new := write(document)) != document.read_text(encoding="utf-8"):
+                document.write_text(new, encoding="utf-8")
+                print(f"{document.relative_to(ROOT)}: written anew")

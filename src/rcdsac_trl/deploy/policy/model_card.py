@@ -1,6 +1,7 @@
 """What a person should know before driving with an agent, as Markdown, and in a line."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
@@ -82,7 +83,9 @@ def model_card(config: AgentConfig, num_parameters: int, measured: Measured | No
         told = f"`{config.context}` in [{config.context_range[0]:g}, {config.context_range[1]:g}]"
     if config.fixed_beta is not None:
         told += f"; it was trained for beta = {config.fixed_beta:g} alone"
-    origin = "\n".join(f"| {key} | {value} |" for key, value in config.provenance.items() if value is not None)
+    origin = "\n".join(
+        f"| {key} | {_written(value)} |" for key, value in config.provenance.items() if value is not None
+    )
     remembered = f", what it saw in the last {config.memory_s:g} s" if config.memory_s > 0.0 else ""
     reported = "raw, not recalibrated" if config.recalibration is None else str(config.recalibration)
     reports = f"| reports | quantiles of the return, {reported} |\n" if config.critic == "quantile" else ""
@@ -97,7 +100,7 @@ A navigation agent of rcdsac_trl: recurrent actor and {config.num_critics}
 ```python
 import rcdsac_trl
 
-policy = rcdsac_trl.load("this/folder")
+policy = rcdsac_trl.load("this/folder")  # or the folder's name, if `rcdsac-trl agents` lists it
 ```
 
 | | |
@@ -125,7 +128,8 @@ def driving_section(measured: Measured) -> str:
         f"Means of {measured.num_episodes} episodes of {told['task']['episode_steps']} steps on {told['num_maps']} "
         f"{told['split']} maps (seed {told['seed']}; maps of version {measured.map_version},\nrules of version "
         f"{measured.rules_version}), which it was never trained on and never chosen by; {measured.confidence:.0%} "
-        f"intervals with the map as the unit.\n{_precision(measured)}",
+        "intervals with the map as the unit.\nIt drove alone: no stop zone, no detours, no watchdog. "
+        f"{_precision(measured)}",
         _driving_table(measured).rstrip(),
         f"To measure it again on the same maps: `{measured.command}`.",
     ]
@@ -238,9 +242,16 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
     return "".join(f"| {' | '.join(row)} |\n" for row in (headings, ["---"] * len(headings), *rows))
 
 
+def _written(value: Any) -> str:
+    """Write where an agent comes from: a number that was learnt in so many digits as anybody compares."""
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
 def _described(robot: RobotSettings) -> str:
     """Say of a robot what somebody compares with the own one."""
-    shape = f"{robot.length_m:g} x {robot.width_m:g} m" if robot.shape == "rectangle" else f"{robot.radius_m:g} m"
+    shape = (
+        f"{robot.length_m:g} x {robot.width_m:g} m" if robot.shape == "rectangle" else f"{robot.radius_m:g} m radius"
+    )
     return (
         f"{robot.shape} of {shape}, {robot.min_linear_velocity:g} to {robot.max_speed_m_per_s:g} m/s, "
         f"{robot.max_turn_deg_per_s:g} degrees/s, range sensor up to {robot.lidar.max_range_m:g} m"

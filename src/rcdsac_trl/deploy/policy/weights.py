@@ -195,6 +195,11 @@ def stored(weights: Weights, *, half: bool = False) -> bytes:
     return save_tensors({name: np.ascontiguousarray(value, dtype) for name, value in weights.tensors.items()})
 
 
+def card_of(weights: Weights, measured: Measured | None) -> str:
+    """Return the card of an agent, Markdown, with what is known of how it drives."""
+    return model_card(weights.config, sum(tensor.size for tensor in weights.tensors.values()), measured)
+
+
 def packed(weights: Weights, *, half: bool = False, measured: Measured | None = None) -> dict[str, bytes]:
     """Return the files of a weights folder: name and content.
 
@@ -206,11 +211,10 @@ def packed(weights: Weights, *, half: bool = False, measured: Measured | None = 
     content = stored(weights, half=half)
     config: dict[str, Any] = {"format_version": FORMAT_VERSION, "weights_sha256": sha256(content).hexdigest()}
     config |= asdict(weights.config)
-    num_parameters = sum(tensor.size for tensor in weights.tensors.values())
     said = {} if measured is None else {MEASURED_NAME: measured.to_json().encode()}
     return {
         WEIGHTS_NAME: content,
-        CARD_NAME: model_card(weights.config, num_parameters, measured).encode(),
+        CARD_NAME: card_of(weights, measured).encode(),
         **said,
         CONFIG_NAME: (json.dumps(config, indent=2) + "\n").encode(),
     }
