@@ -293,7 +293,10 @@ EITHER = "name what to evaluate: either run=<folder or shipped agent>"
         ([RUN, "beta=[-1,-1.0]"], "beta=-1 is given more than once"),
         ([RUN, "beta=[-1,-1.0000000001]"], "beta=-1 is given more than once"),
         (["baseline=dwa", "sampled=true"], "baseline=dwa has no actions to be drawn: leave sampled out"),
-        ([RUN, "beta=[-1]", "collision_weight=[1]"], "rcdsac_pow has no collision weight: leave collision_weight out"),
+        (
+            [RUN, "beta=[-1]", "collision_weight=[1]"],
+            "rcdsac_pow is told no collision weight: leave collision_weight out",
+        ),
         ([RUN, "beta=[-1]", "sensor=sparse"], "sensor=sparse is not what "),
         ([RUN, "beta=[-1]", "checkpoint=first"], "checkpoint=first must be one of best, last"),
         ([RUN, "beta=[-1]", "split=train"], "split=train must be one of evaluation, validation"),

@@ -358,11 +358,12 @@ WEIGHTED = {
         ({"conditioning": "fixed", "relabel": "stored", "beta": -2.5}, "beta = -2.5 is outside the domain [-2, 0]"),
         ({"conditioning": "fixed", "beta": -1.0}, "algo.relabel=resample does nothing"),
         (WEIGHTED | {"collision_weight": (2.0, 0.1)}, "algo.collision_weight=[2.0,0.1] is no range"),
-        (WEIGHTED | {"collision_weight": None}, "give both or neither"),
+        (WEIGHTED | {"collision_weight": None}, "give both, or none and at most a range of one weight"),
+        (WEIGHTED | {"collision_weight": (2.0, 2.0)}, "give both, or none and at most a range of one weight"),
         (WEIGHTED | {"evaluation_collision_weights": (3.0,)}, "collision weight 3 is outside row's range [0.1, 2]"),
         (
             {"collision_weight": (0.1, 2.0), "evaluation_collision_weights": (1.0,)},
-            "algo.collision_weight does not go with algo.conditioning=per_episode",
+            "algo.collision_weight=[0.1, 2.0] does not go with algo.conditioning=per_episode",
         ),
         (
             {"distortion": DistortionSettings("pow", -2.0, 0.0, (-1.0, -1.0))},
@@ -374,6 +375,17 @@ def test_parts_that_do_not_fit_together_are_refused(changes: dict[str, Any], fra
     with pytest.raises(UserInputError) as caught:
         algo(**changes)
     assert fragment in str(caught.value)
+
+
+def test_a_range_of_one_weight_is_what_a_collision_counts_and_told_to_nobody() -> None:
+    twice = algo(collision_weight=(2, 2))
+    assert (twice.fixed_weight, twice.told_weights, twice.context_key) == (2.0, None, "risk")
+    assert twice.conditions([-1], None) == [Condition(beta=-1.0)]
+    with pytest.raises(UserInputError, match="row is told no collision weight"):
+        twice.conditions(None, [2.0])
+    told = algo(**WEIGHTED)
+    assert (told.fixed_weight, told.told_weights, told.context_key) == (1.0, (0.1, 2.0), "collision_weight")
+    assert (algo().fixed_weight, algo().told_weights) == (1.0, None)
 
 
 def test_a_betas_domain_is_checked_wherever_a_beta_is_given() -> None:
@@ -392,7 +404,7 @@ def test_conditions_of_an_evaluation() -> None:
         algo().conditions([], None)
     with pytest.raises(UserInputError, match="more than once"):
         algo().conditions([-1, -1.0], None)
-    with pytest.raises(UserInputError, match="has no collision weight"):
+    with pytest.raises(UserInputError, match="is told no collision weight"):
         algo().conditions([-1], [1.0])
 
     fixed = algo(conditioning="fixed", relabel="stored", beta=-1.0)

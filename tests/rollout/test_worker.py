@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.config.conditions import Condition
-from rcdsac_trl.rollout.environments import environment, evaluation_worker
+from rcdsac_trl.rollout.environments import environment, evaluation_worker, rollout_worker
 from rcdsac_trl.rollout.make_agent import make_loss, make_policy
 from rcdsac_trl.rollout.make_collector import make_episodes
 from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
@@ -28,7 +28,9 @@ from rcdsac_trl.rollout.worker_processes import Drive, RolloutRequest, WorkerPro
 from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system import liveness
 from rcdsac_trl.system.processes import WorkerError
+from rcdsac_trl.training.make_learner import make_replay
 from rcdsac_trl.world.task.env import make_env
+from rcdsac_trl.world.task.rules import REWARD_COMPONENTS, total_reward
 from rcdsac_trl.world.task.world_settings import WorldSettings
 from tiny import STEPS, tiny_settings
 
@@ -160,6 +162,27 @@ def test_episodes_that_end_early_are_the_beginning_of_whole_ones() -> None:
     assert short.tensordict().shape == (2, 7)
     for key in ("action", "pose", ("next", "pose"), ("next", "contact")):
         assert torch.equal(short.tensordict()[key], whole.tensordict()[key][:, :7])
+
+
+@pytest.mark.parametrize("weight", [1.0, 3.0])
+def test_a_weight_of_all_collisions_reaches_updates_and_rewards_and_is_not_told(weight: float) -> None:
+    settings = tiny_settings("rcdsac_pow", f"algo.collision_weight=[{weight},{weight}]")
+    assert make_replay(settings, "cpu").collision_weight == weight
+    world = WorldSettings(settings.map, settings.task, "narrow", num_agents=2, num_workers=0)
+    made = {"split": "train", "seed": 0, "agent_ids": [0, 1], "state_size": settings.network.state_size}
+    env, worker = environment(world, settings.algo, **made), rollout_worker(world, settings.algo, **made)
+    assert set(env.reset().keys()).isdisjoint({"collision_weight"})
+    for agents in (env.base_env.agents, worker.env.agents):
+        agents.reset(range(2))
+        collided = False
+        for _ in range(150):  # straight on, into whatever comes
+            agents.step(np.array([[1.0, 0.0], [1.0, 0.0]]))
+            components = agents.buffers.reward_components
+            collided |= bool((components[:, REWARD_COMPONENTS.index("collision")] < 0.0).any())
+            np.testing.assert_array_equal(agents.buffers.reward[:, 0], total_reward(components, weight))
+        assert collided
+    env.close()
+    worker.close()
 
 
 def test_episodes_are_views_of_what_was_seen() -> None:

@@ -126,6 +126,14 @@ def test_collision_weight_scales_the_stored_component() -> None:
     assert torch.equal(batch["next", "reward"][:, :-1, 0], mark - 14)
 
 
+def test_where_no_weight_is_stored_the_replays_own_scales_the_component() -> None:
+    replay = make_replay(collision_weight=3.0)
+    replay.add_episodes(numbered_episodes(2))
+    batch = replay.sample()
+    # mark + 2 * 3 + 3 * (-10)
+    assert torch.equal(batch["next", "reward"][:, :-1, 0], batch["waypoint"][:, :-1, 0] - 24)
+
+
 def test_batches_derive_from_the_seed() -> None:
     batches = []
     for seed in (0, 0, 1):

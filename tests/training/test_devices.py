@@ -30,7 +30,7 @@ def meta_batch(row: str) -> TensorDict:
 def meta_loss(row: str) -> DistributionalSACLoss:
     """Make the loss of a row on the meta device."""
     algo = tiny_settings(row).algo
-    vectors = VECTOR_OBSERVATIONS | ({} if algo.collision_weight is None else {"collision_weight": 1})
+    vectors = VECTOR_OBSERVATIONS | ({} if algo.told_weights is None else {"collision_weight": 1})
     actor = build_actor(2, vectors, algo.network_measure).to("meta")
     critics = [build_critic(2, vectors, algo.critic, algo.network_measure).to("meta") for _ in range(2)]
     # There is no generator on meta: drawn on the CPU, its numbers are moved.

@@ -274,6 +274,20 @@ def test_a_collision_weight_scales_the_collision_reward_alone(num_workers: int) 
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
+def test_a_weight_of_all_collisions_scales_the_collision_reward_and_is_told_to_nobody(num_workers: int) -> None:
+    def run(**weight: float) -> TensorDictBase:
+        env = make_env(map_settings=SMALL, seed=5, num_workers=num_workers, serial=True, **weight)
+        driven = drive(env, 120)
+        env.close()
+        return driven
+
+    plain, heavy = run(), run(collision_weight=3.0)
+    assert_equal(plain.exclude("reward"), heavy.exclude("reward"))
+    assert (plain["reward_components"][..., 4] < 0).any()
+    torch.testing.assert_close(heavy["reward"] - plain["reward"], 2.0 * plain["reward_components"][..., 4:])
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_reset_brings_a_collision_weight_or_one(num_workers: int) -> None:
     env = make_env(map_settings=SMALL, agent_ids=(0, 1), num_workers=num_workers, serial=True, weighted_collisions=True)
     assert (env.reset()["collision_weight"] == 1.0).all()

@@ -81,26 +81,38 @@ class AlgoSettings:
             object.__setattr__(self, "collision_weight", (float(low), float(high)))
         weights = tuple(float(weight) for weight in self.evaluation_collision_weights)
         object.__setattr__(self, "evaluation_collision_weights", weights)
-        if bool(weights) != (self.collision_weight is not None):
+        if bool(weights) != (self.told_weights is not None):
             raise UserInputError(
                 f"algo.evaluation_collision_weights={list(weights)} does not go with "
-                f"algo.collision_weight={self.collision_weight}: give both or neither"
+                f"algo.collision_weight={self.collision_weight}: give both, or none and at most a range of one weight"
             )
         if weights and self.conditioning == "per_episode":
             raise UserInputError(
-                "algo.collision_weight does not go with algo.conditioning=per_episode: an episode tells the networks "
-                "either a weight or a beta"
+                f"algo.collision_weight={list(self.told_weights or ())} does not go with algo.conditioning=per_episode:"
+                " an episode tells the networks either a weight or a beta, so give [w,w], one weight for all"
             )
         for weight in weights:
             self._check_weight(weight)
         check_unique(self.default_conditions)
 
     def _check_weight(self, weight: float) -> None:
-        low, high = self.collision_weight or (1.0, 1.0)
+        low, high = self.told_weights or (1.0, 1.0)
         if not low <= weight <= high:
             raise UserInputError(
                 f"collision weight {weight:g} is outside {self.name}'s range [{low:g}, {high:g}]: choose one inside"
             )
+
+    @property
+    def told_weights(self) -> tuple[float, float] | None:
+        """Range of the collision weights that episodes are told; None where there is nothing to tell."""
+        if self.collision_weight is None or self.collision_weight[0] == self.collision_weight[1]:
+            return None
+        return self.collision_weight
+
+    @property
+    def fixed_weight(self) -> float:
+        """What a collision counts in training and in returns where episodes are told no weight, times its reward."""
+        return 1.0 if self.collision_weight is None or self.told_weights is not None else self.collision_weight[0]
 
     @property
     def network_measure(self) -> RiskMeasure | None:
@@ -112,14 +124,14 @@ class AlgoSettings:
         """Key of the context that is drawn for an episode and read by the networks."""
         if self.conditioning == "per_episode":
             return "risk"
-        return "collision_weight" if self.collision_weight is not None else None
+        return "collision_weight" if self.told_weights is not None else None
 
     @property
     def default_conditions(self) -> list[Condition]:
         """Where validation looks, and the paper's table."""
         if self.conditioning == "per_episode":
             return [Condition(beta=beta) for beta in self.distortion.evaluation_betas]
-        if self.collision_weight is not None:
+        if self.told_weights is not None:
             return [Condition(collision_weight=weight) for weight in self.evaluation_collision_weights]
         return [Condition(beta=self.beta)]
 
@@ -129,8 +141,8 @@ class AlgoSettings:
         Raises:
             UserInputError: if a beta or a weight is superfluous or outside its domain, or none is left.
         """
-        if weights is not None and self.collision_weight is None:
-            raise UserInputError(f"{self.name} has no collision weight: leave collision_weight out")
+        if weights is not None and self.told_weights is None:
+            raise UserInputError(f"{self.name} is told no collision weight: leave collision_weight out")
         if self.conditioning == "per_episode" and betas is not None:
             if not betas:
                 shown = ",".join(f"{beta:g}" for beta in self.distortion.evaluation_betas)

@@ -104,8 +104,8 @@ def agent_config(
     context_range = None
     if (measure := algo.network_measure) is not None:
         context, context_range = "beta", (measure.low, measure.high)
-    elif algo.collision_weight is not None:
-        context, context_range = "collision_weight", algo.collision_weight
+    elif algo.told_weights is not None:
+        context, context_range = "collision_weight", algo.told_weights
     return AgentConfig(
         name=algo.name,
         sensor=agent.sensor.name,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 from torchrl.envs import EnvBase, InitTracker, StepCounter, TransformedEnv
 
@@ -44,7 +45,7 @@ def environment(
         seed=seed,
         agent_ids=agent_ids,
         first_episode=first_episode,
-        weighted_collisions=_is_weighted(algo),
+        **_weights(algo),
     )
     env = TransformedEnv(base)
     env.append_transform(InitTracker())
@@ -72,14 +73,17 @@ def rollout_worker(
         split=split,
         seed=seed,
         agent_ids=agent_ids,
-        weighted_collisions=_is_weighted(algo),
+        **_weights(algo),
     )
     sampler = _sampler(algo, seed, agent_ids, conditions, 0)
     return RolloutWorker(env, sampler, state_size=state_size, steps=world.task.episode_steps)
 
 
-def _is_weighted(algo: AlgoSettings | None) -> bool:
-    return algo is not None and algo.collision_weight is not None
+def _weights(algo: AlgoSettings | None) -> dict[str, Any]:
+    """Return what collisions count in the rewards of the environment."""
+    if algo is None:
+        return {}
+    return {"weighted_collisions": algo.told_weights is not None, "collision_weight": algo.fixed_weight}
 
 
 def _sampler(
@@ -94,8 +98,8 @@ def _sampler(
         return None
     asked = conditions or ()
     draw: Callable[[float], float]
-    if algo.collision_weight is not None:
-        draw = partial(_between, *algo.collision_weight)
+    if algo.told_weights is not None:
+        draw = partial(_between, *algo.told_weights)
         fixed = [c.collision_weight for c in asked if c.collision_weight is not None]
     else:
         measure = algo.distortion.measure

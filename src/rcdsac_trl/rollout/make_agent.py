@@ -62,7 +62,7 @@ def unpacked_loss(settings: TrainingSettings, packed: bytes) -> LossModule:
 
 def _vectors(settings: TrainingSettings) -> dict[str, int]:
     """Name the vector observations of the networks, and their sizes."""
-    weighted = settings.algo.collision_weight is not None
+    weighted = settings.algo.told_weights is not None
     return vector_observations(settings.sensor.memory_s) | ({"collision_weight": 1} if weighted else {})
 
 

@@ -150,6 +150,7 @@ class SequenceReplay:
         vectors: name and size of the observations besides `range`.
         seed: root seed; batches are drawn from its stream ``"replay"``.
         device: where sampled batches go; the storage stays in main memory.
+        collision_weight: scale of the collision reward where no weight is stored.
 
     Raises:
         UserInputError: if a sequence is longer than an episode or the capacity is below one episode.
@@ -167,6 +168,7 @@ class SequenceReplay:
         vectors: Mapping[str, int] = VECTOR_OBSERVATIONS,
         seed: int,
         device: torch.device | str = "cpu",
+        collision_weight: float = 1.0,
     ) -> None:
         if capacity_steps < episode_steps:
             raise UserInputError(
@@ -179,6 +181,7 @@ class SequenceReplay:
         self.sequence_slots = sequence_length + 1
         self.batch_size = batch_size
         self.device = torch.device(device)
+        self.collision_weight = collision_weight
         episode_slots = episode_steps + 1
         self.capacity_episodes = capacity_steps // episode_steps
         self.episodes_added = 0
@@ -263,13 +266,13 @@ class SequenceReplay:
 
         Returns:
             TensorDict ``[B, L + 1]`` with `range`, the vectors, `action`, the context keys,
-            ``("next", "reward")`` (its collision part scaled by `collision_weight` where that is stored) and
+            ``("next", "reward")`` (its collision part scaled by the episode's `collision_weight`, or the replay's) and
             ``("next", "terminated")`` (always false: an episode is only ever truncated). In the last slot only
             the observation counts.
         """
         flat = self.buffer.sample().to(self.device)
         slots = flat.reshape(self.batch_size, self.sequence_slots)
-        weight = slots["collision_weight"] if "collision_weight" in self.context_keys else 1.0
+        weight = slots["collision_weight"] if "collision_weight" in self.context_keys else self.collision_weight
         reward = slots["reward_rest"] + weight * slots["reward_collision"]
         kept = {key: _step_by_step(slots[key]) for key in self.vectors} | {"action": slots["action"]}
         # One value expanded: the loss then knows that a sequence shares it.

@@ -40,6 +40,7 @@ def make_replay(settings: TrainingSettings, device: str, inherited_steps: int = 
         vectors=vector_observations(settings.sensor.memory_s),
         seed=settings.seed,
         device=device,
+        collision_weight=settings.algo.fixed_weight,
     )
 
 

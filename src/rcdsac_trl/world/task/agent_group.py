@@ -47,6 +47,7 @@ class AgentGroup(OfOneProcess):
         gui: show PyBullet's window for the first agent.
         memory_s: for how long an agent is told of points that it saw, s; 0: not at all.
         robot: which one every agent is.
+        collision_weight: factor of the collision reward in steps that name none.
 
     Attributes:
         buffers: what the agents wrote last, overwritten by every reset and step.
@@ -69,6 +70,7 @@ class AgentGroup(OfOneProcess):
         gui: bool,
         memory_s: float = 0.0,
         robot: RobotSettings = PAPER,
+        collision_weight: float = 1.0,
     ) -> None:
         if split not in SPLITS:
             raise UserInputError(f"split={split!r} does not exist; choose one of {', '.join(SPLITS)}")
@@ -91,6 +93,7 @@ class AgentGroup(OfOneProcess):
             )
             for row, agent_id in enumerate(agent_ids)
         ]
+        self._collision_weight = collision_weight
         self._mask = mask
         self._max_range_m = robot.lidar.max_range_m
         self._first_episode = _not_negative("first_episode", first_episode)
@@ -136,8 +139,8 @@ class AgentGroup(OfOneProcess):
 
         Args:
             actions: normalised actions, [n, 2], in [-1, 1].
-            collision_weights: factor of each agent's collision reward, [n], None for 1; the components are
-                written without it.
+            collision_weights: factor of each agent's collision reward, [n], None for that of the group; the components
+                are written without it.
 
         Raises:
             UserInputError: an action is not a number in [-1, 1], or an agent was never reset.
@@ -146,7 +149,7 @@ class AgentGroup(OfOneProcess):
         for agent, action in zip(self._agents, self._checked(actions), strict=True):
             agent.step(action)
         self._collect(range(len(self)))
-        weights = 1.0 if collision_weights is None else collision_weights
+        weights = self._collision_weight if collision_weights is None else collision_weights
         buffers.reward[:, 0] = rules.total_reward(buffers.reward_components, weights)
 
     def scene(self, row: int) -> Scene:

@@ -52,6 +52,7 @@ class NavigationEnv(OfOneProcess, EnvBase):
         first_episode: number of the first episode, also after :meth:`set_seed`.
         weighted_collisions: read ``collision_weight`` [1] from the input and scale the collision reward by
             it; ``reward_components`` stay unscaled. It is an observation too: 1, or what a reset brings.
+        collision_weight: scale of the collision reward where none is read.
         changes: fields of :class:`WorldSettings` that differ from `world`.
 
     Raises:
@@ -72,6 +73,7 @@ class NavigationEnv(OfOneProcess, EnvBase):
         agent_ids: Sequence[int] | None = None,
         first_episode: int = 0,
         weighted_collisions: bool = False,
+        collision_weight: float = 1.0,
         **changes: Any,
     ) -> None:
         world, ids = _with_agents(world, agent_ids, {**changes, "num_workers": 0})
@@ -87,6 +89,7 @@ class NavigationEnv(OfOneProcess, EnvBase):
             agent_ids=ids,
             first_episode=first_episode,
             gui=world.gui,
+            collision_weight=collision_weight,
         )
         self._weighted = weighted_collisions
         # The arrays that the agents write into, as tensors; what is never true is among them.
@@ -207,6 +210,7 @@ def make_env(
     agent_ids: Sequence[int] | None = None,
     first_episode: int = 0,
     weighted_collisions: bool = False,
+    collision_weight: float = 1.0,
     serial: bool = False,
     **changes: Any,
 ) -> EnvBase:
@@ -220,6 +224,7 @@ def make_env(
         agent_ids: global numbers of the n agents, in the order of the flattened batch.
         first_episode: number of the first episode.
         weighted_collisions: whether the environment reads ``collision_weight``.
+        collision_weight: scale of the collision reward where it does not.
         serial: put the W environments into a ``SerialEnv`` in this process instead (for tests and debugging).
         changes: fields of :class:`WorldSettings` that differ from `world`.
 
@@ -240,6 +245,7 @@ def make_env(
         "seed": seed,
         "first_episode": first_episode,
         "weighted_collisions": weighted_collisions,
+        "collision_weight": collision_weight,
     }
     if workers == 0:
         return NavigationEnv(world, agent_ids=ids, **shared)
