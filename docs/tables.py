@@ -4,9 +4,10 @@ A table of agents stands between two comments, of which the first names whose it
 ``weights/``, and baselines of ``results/``, of which an evaluation is read; ``<agent>:<beta>,<beta>``, of RCWR
 weights, takes these rows of it alone. A table of seeds names agents of ``results/`` that were trained again, and finds
 the other trainings in ``results/seed-*/``. Tables beside the paper name a sensor, and are over all trainings of its
-rows in ``results/``: the means, the claims with their verdicts, and differences from agents or baselines. The comment
-of a table of the office course names the folder of what ``course`` wrote, that of a table of disturbances the files of
-``docs/disturbances.py``, in their order. The table of an accelerator is what ``benchmarks/accelerator.py`` wrote::
+rows in ``results/``: the means, the claims with their verdicts, differences from agents or baselines, and averages
+over the settings that the paper's text averages. The comment of a table of the office course names the folder of what
+``course`` wrote, that of a table of disturbances the files of ``docs/disturbances.py``, in their order. The table of an
+accelerator is what ``benchmarks/accelerator.py`` wrote::
 
     <!-- agents: sac-narrow pursuit-narrow -->
     | agent | collisions | ..
@@ -19,6 +20,8 @@ of a table of the office course names the folder of what ``course`` wrote, that 
     <!-- claims: end -->
     <!-- differences: narrow rcdsac_cvar rcdsac_pow from sac mppi -->
     <!-- differences: end -->
+    <!-- averages: narrow sparse -->
+    <!-- averages: end -->
     <!-- course: results/course -->
     <!-- course: end -->
     <!-- disturbances: mppi -->
@@ -42,9 +45,9 @@ from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_table import course_table
 from rcdsac_trl.report.findings import labels
 from rcdsac_trl.report.read import Episodes, read_episodes
-from rcdsac_trl.report.rows import condition_label, paper_table, row_label
+from rcdsac_trl.report.rows import called, condition_label, paper_table, row_label
 from rcdsac_trl.report.statistics import Term, compare, contrast
-from rcdsac_trl.report.table import comparison
+from rcdsac_trl.report.table import averaged_settings, comparison
 from rcdsac_trl.report.training_errors import TrainingErrors
 from rcdsac_trl.report.verdict_words import numbers, of_agents
 from rcdsac_trl.report.verdicts import Finding
@@ -59,6 +62,8 @@ _COURSE_HEADINGS = (
     *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
     *("in reverse: arrived", "collisions a run", "time, s"),
 )
+# What the others are compared with where kinds of agents are averaged.
+_FIRST = "RC-DSAC (resample)"
 _HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goals")
 
 
@@ -70,6 +75,7 @@ def renewed(text: str) -> str:
         "paper": lambda sensor: table_beside_the_paper(_paper(), *sensor),
         "claims": lambda sensors: table_of_claims(_claims(), " ".join(sensors)),
         "differences": lambda names: table_of_differences(_paper(), names),
+        "averages": lambda sensors: table_of_averages(_paper(), sensors),
         "course": lambda folders: table_of_course(*(ROOT / folder for folder in folders)),
         "disturbances": lambda names: table_of_disturbances(_driven(names)),
     }
@@ -202,6 +208,53 @@ def table_of_differences(episodes: Episodes, names: Sequence[str]) -> str:
             rows.append(cells)
     headings = [f"{metric}, from {row_label(each['agent'])}" for each in against for metric in ("collisions", "reward")]
     return _markdown(["agent", *headings], rows)
+
+
+def table_of_averages(episodes: Episodes, sensors: Sequence[str]) -> str:
+    """Return kinds of agents, averaged as the paper's text does, and how RC-DSAC (resample) differs, Markdown.
+
+    Of RC-DSAC and DSAC the four settings that DSAC has are averaged, of RCWR its weights. Intervals are over maps and
+    trainings.
+
+    Args:
+        episodes: of all of them.
+        sensors: two columns each.
+    """
+    errors = TrainingErrors(episodes)
+    columns = [_averages_of(episodes, errors, sensor) for sensor in sensors]
+    headings = [heading for sensor in sensors for heading in (f"{sensor}: collisions / reward", f"{_FIRST} from it")]
+    names = [name for name in columns[0] if all(name in column for column in columns)]
+    return _markdown(["averaged", *headings], [[name, *(c for of in columns for c in of[name])] for name in names])
+
+
+def _averages_of(episodes: Episodes, errors: TrainingErrors, sensor: str) -> dict[str, tuple[str, str]]:
+    """Return each kind's means with a sensor, and what RC-DSAC (resample) has more."""
+    kinds = _averaged_conditions(episodes, sensor)
+    cells = {}
+    for name, conditions in kinds.items():
+        means, more = [], []
+        for metric, form in (("collisions", ".2f"), ("reward", ".0f")):
+            means.append(f"{np.mean([episodes.of(each, metric).mean() for each in conditions]):{form}}")
+            sides = [(sign / len(of), each) for sign, of in ((1, kinds[_FIRST]), (-1, conditions)) for each in of]
+            terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]
+            found = contrast(terms, error=errors.of_sum(sides, metric))
+            more.append(f"{found.value:{form}} [{found.low:{form}}, {found.high:{form}}]")
+        trained = sorted({len(episodes.of(each, "reward")) for each in conditions})
+        trainings = "" if name == "MPPI" else f" ({' to '.join(map(str, dict.fromkeys((trained[0], trained[-1]))))})"
+        cells[name] = " / ".join(means) + trainings, "" if name == _FIRST else ", ".join(more)
+    return cells
+
+
+def _averaged_conditions(episodes: Episodes, sensor: str) -> dict[str, list[pd.Series]]:
+    """Return which conditions of each kind of agent are averaged, by the kind's name."""
+    settings, kinds = averaged_settings(), dict[str, list[pd.Series]]()
+    here = episodes.conditions[episodes.conditions["sensor"] == sensor]
+    for _, condition in here.iterrows():
+        name, measure = called(condition["agent"])
+        if pd.isna(condition["beta"]) or (measure, condition["beta"]) in settings:
+            kinds.setdefault(name, []).append(condition)
+    order = list(dict.fromkeys(paper_table()["name"]))  # what the paper lacks comes last
+    return dict(sorted(kinds.items(), key=lambda kind: order.index(kind[0]) if kind[0] in order else len(order)))
 
 
 def table_of_course(folder: Path) -> str:

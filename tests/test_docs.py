@@ -171,6 +171,29 @@ def test_tables_beside_the_paper_are_over_all_trainings() -> None:
     assert beside[2].startswith("| SAC |  |  | 0.20 ± 0.10 | [0.00, 1.46] | 1.76 ± 2.02 |")
 
 
+def test_averages_are_over_what_the_paper_averages_and_all_trainings() -> None:
+    """CVaR at 0.25 and 0.75 has 0.1 and 0.3 collisions, the power law 0.2, all 0.1 more in a second training; MPPI 0.5.
+
+    At 0.5 CVaR has 9, which does not count. A measure's two trainings have a variance of 0.005, their mean half of it,
+    the mean of both measures a quarter: 0.035 squared, and t of two degrees of freedom is 4.30.
+    """
+    table_of = runpy.run_path(str(ROOT / "docs" / "tables.py"))["table_of_averages"]
+    betas = {0.25: 0.1, 0.5: 9.0, 0.75: 0.3}
+    rows = [("rcdsac_cvar", seed, beta, value + 0.1 * seed) for seed in (0, 1) for beta, value in betas.items()]
+    rows += [("rcdsac_pow", seed, beta, 0.2 + 0.1 * seed) for seed in (0, 1) for beta in (-2.0, -1.0)]
+    rows.append(("mppi", 0, float("nan"), 0.5))
+    driven = [(agent, seed, beta, map_, value, 500.0) for agent, seed, beta, value in rows for map_ in (0, 1)]
+    table = pd.DataFrame(driven, columns=["agent", "train_seed", "beta", "map", "collisions", "reward"])
+    told = {"sensor": "narrow", "collision_weight": None, "beta_controller": None, "measure": None}
+    table = table.assign(**told, helped="", weights=None, episode=0, trained=table["agent"] != "mppi")
+    episodes = Episodes(table.astype({"collision_weight": float}), {"num_maps": 2, "num_episodes": 1}, pd.DataFrame())
+    lines = table_of(episodes, ["narrow"]).splitlines()
+    assert lines[2] == "| RC-DSAC (resample) | 0.25 / 500 (2) |  |"
+    name, means, more = (cell.strip() for cell in lines[3].strip("|").split("|"))
+    assert (name, means) == ("MPPI", "0.50 / 500")
+    assert more == "-0.25 [-0.40, -0.10], 0 [0, 0]"
+
+
 def test_the_table_of_the_course_is_what_was_driven(tmp_path: Path) -> None:
     table = runpy.run_path(str(ROOT / "docs" / "tables.py"))["table_of_course"]
     assert table(tmp_path) == "Not driven yet.\n"
