@@ -46,7 +46,7 @@ from rcdsac_trl.report.course_table import course_table
 from rcdsac_trl.report.findings import labels
 from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.report.rows import called, condition_label, paper_table, row_label
-from rcdsac_trl.report.statistics import Term, compare, contrast
+from rcdsac_trl.report.statistics import Interval, Term, compare, contrast
 from rcdsac_trl.report.table import averaged_settings, comparison
 from rcdsac_trl.report.training_errors import TrainingErrors
 from rcdsac_trl.report.verdict_words import numbers, of_agents
@@ -203,8 +203,7 @@ def table_of_differences(episodes: Episodes, names: Sequence[str]) -> str:
                 for metric, form in (("collisions", ".2f"), ("reward", ".0f")):
                     sides = ((1.0, condition), (-1.0, other))
                     terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]
-                    found = contrast(terms, error=errors.between(condition, other, metric))
-                    cells.append(f"{found.value:{form}} [{found.low:{form}}, {found.high:{form}}]")
+                    cells.append(_with_interval(contrast(terms, error=errors.between(condition, other, metric)), form))
             rows.append(cells)
     headings = [f"{metric}, from {row_label(each['agent'])}" for each in against for metric in ("collisions", "reward")]
     return _markdown(["agent", *headings], rows)
@@ -223,8 +222,11 @@ def table_of_averages(episodes: Episodes, sensors: Sequence[str]) -> str:
     errors = TrainingErrors(episodes)
     columns = [_averages_of(episodes, errors, sensor) for sensor in sensors]
     headings = [heading for sensor in sensors for heading in (f"{sensor}: collisions / reward", f"{_FIRST} from it")]
-    names = [name for name in columns[0] if all(name in column for column in columns)]
-    return _markdown(["averaged", *headings], [[name, *(c for of in columns for c in of[name])] for name in names])
+    order = list(dict.fromkeys(paper_table()["name"]))  # what the paper lacks comes last
+    names = sorted({name for column in columns for name in column}, key=lambda name: (*order, name).index(name))
+    return _markdown(
+        ["averaged", *headings], [[name, *(c for of in columns for c in of.get(name, ("", "")))] for name in names]
+    )
 
 
 def _averages_of(episodes: Episodes, errors: TrainingErrors, sensor: str) -> dict[str, tuple[str, str]]:
@@ -235,26 +237,39 @@ def _averages_of(episodes: Episodes, errors: TrainingErrors, sensor: str) -> dic
         means, more = [], []
         for metric, form in (("collisions", ".2f"), ("reward", ".0f")):
             means.append(f"{np.mean([episodes.of(each, metric).mean() for each in conditions]):{form}}")
+            if name == _FIRST or _FIRST not in kinds:
+                continue
             sides = [(sign / len(of), each) for sign, of in ((1, kinds[_FIRST]), (-1, conditions)) for each in of]
             terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]
-            found = contrast(terms, error=errors.of_sum(sides, metric))
-            more.append(f"{found.value:{form}} [{found.low:{form}}, {found.high:{form}}]")
-        trained = sorted({len(episodes.of(each, "reward")) for each in conditions})
-        trainings = "" if name == "MPPI" else f" ({' to '.join(map(str, dict.fromkeys((trained[0], trained[-1]))))})"
-        cells[name] = " / ".join(means) + trainings, "" if name == _FIRST else ", ".join(more)
+            more.append(_with_interval(contrast(terms, error=errors.of_sum(sides, metric)), form))
+        cells[name] = " / ".join(means) + _trainings_of(episodes, conditions), ", ".join(more)
     return cells
 
 
+def _trainings_of(episodes: Episodes, conditions: Sequence[pd.Series]) -> str:
+    """Say how many trainings some conditions are of, `` (1 to 2)``; of planners nothing."""
+    trained = set(episodes.table.loc[episodes.table["trained"], "agent"])
+    numbers = [len(episodes.of(each, "reward")) for each in conditions if each["agent"] in trained]
+    if not numbers:
+        return ""
+    return f" ({min(numbers)})" if min(numbers) == max(numbers) else f" ({min(numbers)} to {max(numbers)})"
+
+
+def _with_interval(found: Interval, form: str) -> str:
+    return f"{found.value:{form}} [{found.low:{form}}, {found.high:{form}}]"
+
+
 def _averaged_conditions(episodes: Episodes, sensor: str) -> dict[str, list[pd.Series]]:
-    """Return which conditions of each kind of agent are averaged, by the kind's name."""
-    settings, kinds = averaged_settings(), dict[str, list[pd.Series]]()
+    """Return which conditions of each kind of agent are averaged, by its name; kinds that lack a setting: none."""
+    settings, kinds, found = averaged_settings(), dict[str, list[pd.Series]](), dict[str, set[Any]]()
     here = episodes.conditions[episodes.conditions["sensor"] == sensor]
-    for _, condition in here.iterrows():
+    for _, condition in here[here["beta_controller"].isna()].iterrows():
         name, measure = called(condition["agent"])
-        if pd.isna(condition["beta"]) or (measure, condition["beta"]) in settings:
+        setting = measure, condition["beta"]
+        if pd.isna(condition["beta"]) or setting in settings:
             kinds.setdefault(name, []).append(condition)
-    order = list(dict.fromkeys(paper_table()["name"]))  # what the paper lacks comes last
-    return dict(sorted(kinds.items(), key=lambda kind: order.index(kind[0]) if kind[0] in order else len(order)))
+            found.setdefault(name, set()).update(() if pd.isna(condition["beta"]) else (setting,))
+    return {name: kind for name, kind in kinds.items() if len(found[name]) in (0, len(settings))}
 
 
 def table_of_course(folder: Path) -> str:

@@ -108,7 +108,7 @@ def filled_learner(row: str, *overrides: str) -> Learner:
 
     content: dict = observations() | {"action": 2.0 * uniform(2) - 1.0}
     if algo.context_key is not None:
-        low, high = algo.collision_weight or (algo.distortion.low, algo.distortion.high)
+        low, high = algo.told_weights or (algo.distortion.low, algo.distortion.high)
         content[algo.context_key] = low + (high - low) * uniform(1)[:, :1].expand(-1, STEPS, -1)
     content["next"] = observations() | {"reward_components": -uniform(len(REWARD_COMPONENTS))}
     learner.replay.add_episodes(TensorDict(content, batch_size=[ITERATIONS * AGENTS, STEPS]))

@@ -300,7 +300,7 @@ def test_read_refuses_in_one_sentence(changes: dict[str, Any], sentence: str) ->
 
 @pytest.mark.parametrize("root", ["train", "evaluate"])
 def test_every_leaf_of_the_root_is_a_field(root: str) -> None:
-    """What is written in the root file lands in the settings, where the test above sees it read."""
+    """What is written in the root file lands in the settings, where `test_dead_keys` sees it read."""
     settings: Any
     if root == "train":
         settings = training_settings(compose("train", ["+algo=rcdsac_pow", "preset=paper"]))
@@ -358,8 +358,10 @@ WEIGHTED = {
         ({"conditioning": "fixed", "relabel": "stored", "beta": -2.5}, "beta = -2.5 is outside the domain [-2, 0]"),
         ({"conditioning": "fixed", "beta": -1.0}, "algo.relabel=resample does nothing"),
         (WEIGHTED | {"collision_weight": (2.0, 0.1)}, "algo.collision_weight=[2.0,0.1] is no range"),
-        (WEIGHTED | {"collision_weight": None}, "give both, or none and at most a range of one weight"),
-        (WEIGHTED | {"collision_weight": (2.0, 2.0)}, "give both, or none and at most a range of one weight"),
+        (WEIGHTED | {"collision_weight": None}, "algo.collision_weight=None: nobody is told a weight, so give []"),
+        (WEIGHTED | {"collision_weight": (2.0, 2.0)}, "[2.0, 2.0]: nobody is told a weight, so give []"),
+        (WEIGHTED | {"evaluation_collision_weights": ()}, "give some of the range"),
+        (WEIGHTED | {"collision_weight": (1.0, 1e39)}, "is no range: give [low,high] with 0 <= low <= high <= 1000"),
         (WEIGHTED | {"evaluation_collision_weights": (3.0,)}, "collision weight 3 is outside row's range [0.1, 2]"),
         (
             {"collision_weight": (0.1, 2.0), "evaluation_collision_weights": (1.0,)},

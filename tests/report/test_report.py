@@ -234,13 +234,16 @@ def test_whole_betas_are_compared_without_a_warning(tmp_path: Path, monkeypatch:
     assert (shown[("narrow", "collisions, paper")] != "").all()
 
 
-def test_seeds_of_an_agent_that_have_other_risk_measures_are_not_averaged(tmp_path: Path) -> None:
+def test_seeds_of_an_agent_that_were_trained_otherwise_are_not_averaged(tmp_path: Path) -> None:
     power = evaluate(tmp_path / "power", "rcdsac_pow", {-1.0: 0}, measure="pow")
     wang = evaluate(tmp_path / "wang", "rcdsac_pow", {-1.0: 2}, train_seed=1, measure="wang")
     with pytest.raises(
         UserInputError, match=r"rcdsac_pow, with the risk measures pow and wang: train .* \(algo\.name\)"
     ):
         read_episodes([power, wang])
+    twice = evaluate(tmp_path / "twice", "rcdsac_pow", {-1.0: 2}, train_seed=1, trained_collision_weight=2.0)
+    with pytest.raises(UserInputError, match=r"rcdsac_pow, trained with collisions that count 1 times and 2 times: "):
+        read_episodes([power, twice])
     again = evaluate(tmp_path / "again", "rcdsac_pow", {-1.0: 2}, train_seed=2, measure="pow")
     assert len(read_episodes([power, again]).conditions) == 1
 

@@ -44,6 +44,7 @@ def test_a_worker_as_a_collector_drives_what_it_is_asked_for() -> None:
     make = partial(_worker, settings, [0, 1])
     requests = [RolloutRequest(number, 3 - number, packed(make_actor(settings))) for number in range(2)]
     worker, collector = LocalWorker(make), WorkerCollector([make], worker_idx=1, frames_per_batch=7)
+    assert collector  # Ray asks it of what has raised
     assert collector.stats() == {STEPS: AT_REST}
     for request in requests:
         collector.prepare(request)
@@ -187,12 +188,27 @@ def test_a_cluster_without_room_is_told(cluster: Any) -> None:
         RayWorkers(lambda cores: makes, address=None, cores=1, timeout_s=1.0)
 
 
+def test_wrong_input_that_is_found_as_a_worker_is_made_is_told_with_the_first_batch() -> None:
+    @contextlib.contextmanager
+    def make() -> Iterator[Drive]:
+        raise UserInputError("there are no such maps: give others")
+        yield
+
+    collector = WorkerCollector([make])
+    with pytest.raises(UserInputError, match="no such maps"):
+        collector.next()
+
+
 @pytest.mark.slow
-def test_wrong_input_that_a_process_finds_is_told_as_such(cluster: Any) -> None:
+@pytest.mark.parametrize("when", ["it is made", "it drives"])
+def test_wrong_input_that_a_process_finds_is_told_as_such(cluster: Any, when: str) -> None:
     from rcdsac_trl.rollout.ray_workers import RayWorkers
 
     @contextlib.contextmanager
     def make() -> Iterator[Drive]:
+        if when == "it is made":
+            raise UserInputError("there is no map 7: give others")
+
         def drive(request: RolloutRequest, before_step: Callable[[], None]) -> EpisodeBatch:
             raise UserInputError(f"there is no map {request.map_index}: give others")
 

@@ -630,8 +630,8 @@ def test_every_episode_is_told_a_number_of_its_own(trained: Trained, row: str) -
     if algo.context_key == "risk":  # the whole range from the first iteration, also while its distortion is ramped up
         low, high, told = algo.distortion.low, algo.distortion.high, training["beta"]
     else:
-        assert algo.collision_weight is not None
-        (low, high), told = algo.collision_weight, training["collision_weight"]
+        assert algo.told_weights is not None
+        (low, high), told = algo.told_weights, training["collision_weight"]
     assert told.between(low, high).all()
     assert told.nunique() == AGENTS * ITERATIONS
 

@@ -265,10 +265,12 @@ def test_a_shipped_agent_on_another_map_robot_and_measure(tmp_path: Path) -> Non
         "robot=turtlebot3_burger",
         "sensor=full",
         "sensor.memory_s=12",
+        "algo.collision_weight=[2,2]",
     )
     told = (tmp_path / "run" / "train.log").read_text()
     assert "not copied: learning actor and target critics (the averaged actor and the critics stand for them), " in told
-    assert "; measure pow becomes cvar; sensor narrow becomes full; robot paper becomes turtlebot3_burger\n" in told
+    changed = "robot paper becomes turtlebot3_burger; what a collision counts 1 becomes 2"
+    assert f"; measure pow becomes cvar; sensor narrow becomes full; {changed}\n" in told
     assert_equal_states(trainer.learner.average.module, named_agent("rcdsac_pow-narrow").load()[1].module)
 
 

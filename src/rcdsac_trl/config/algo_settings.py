@@ -35,6 +35,10 @@ class DistortionSettings:
         return make_measure(self.name, self.low, self.high)
 
 
+# A collision of -10 then costs what an episode earns in a lifetime; larger is a slip.
+_LARGEST_WEIGHT = 1000.0
+
+
 @dataclass(frozen=True)
 class AlgoSettings:
     """A row of the paper's table as a choice of parts (``conf/algo``)."""
@@ -74,17 +78,23 @@ class AlgoSettings:
             )
         if self.collision_weight is not None:
             low, high = self.collision_weight
-            if not 0 <= low <= high:
+            if not 0 <= low <= high <= _LARGEST_WEIGHT:
                 raise UserInputError(
-                    f"algo.collision_weight=[{low},{high}] is no range: give [low,high] with 0 <= low <= high"
+                    f"algo.collision_weight=[{low},{high}] is no range: give [low,high] with 0 <= low <= high <= "
+                    f"{_LARGEST_WEIGHT:g}"
                 )
             object.__setattr__(self, "collision_weight", (float(low), float(high)))
         weights = tuple(float(weight) for weight in self.evaluation_collision_weights)
         object.__setattr__(self, "evaluation_collision_weights", weights)
         if bool(weights) != (self.told_weights is not None):
+            given = None if self.collision_weight is None else list(self.collision_weight)
             raise UserInputError(
-                f"algo.evaluation_collision_weights={list(weights)} does not go with "
-                f"algo.collision_weight={self.collision_weight}: give both, or none and at most a range of one weight"
+                f"algo.evaluation_collision_weights={list(weights)} does not go with algo.collision_weight={given}: "
+                + (
+                    "nobody is told a weight, so give [], and a name (algo.name)"
+                    if weights
+                    else "give some of the range"
+                )
             )
         if weights and self.conditioning == "per_episode":
             raise UserInputError(
@@ -111,7 +121,7 @@ class AlgoSettings:
 
     @property
     def fixed_weight(self) -> float:
-        """What a collision counts in training and in returns where episodes are told no weight, times its reward."""
+        """Factor of the collision reward in training and in returns where episodes are told none; 1 where they are."""
         return 1.0 if self.collision_weight is None or self.told_weights is not None else self.collision_weight[0]
 
     @property

@@ -174,6 +174,8 @@ def _described(
         "task": asdict(spec.world.task),
         "commit": commit(),
     }
+    if trained.algo.fixed_weight != 1.0:
+        described["trained_collision_weight"] = trained.algo.fixed_weight
     if spec.latency_s:
         described["latency_s"] = spec.latency_s
     if spec.controller is not None:

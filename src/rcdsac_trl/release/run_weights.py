@@ -59,6 +59,8 @@ def weights_of_run(folder: Path, checkpoint: CheckpointName) -> Weights:
         num_critics += 1
     provenance = _provenance(folder, checkpoint, saved.progress)
     provenance[TEMPERATURE] = float(states["loss"]["log_alpha"].exp())
+    if agent.algo.fixed_weight != 1.0:
+        provenance["collision_weight"] = agent.algo.fixed_weight
     config = agent_config(agent, num_critics, provenance)
     return Weights(config, {name: np.ascontiguousarray(tensor.numpy()) for name, tensor in tensors.items()})
 

@@ -269,6 +269,12 @@ def _check_one_agent(evaluations: Sequence[Evaluation]) -> None:
                 f"{first.folder} and {other.folder} are both of {agent[0]}, with the risk measures {here} and {there}: "
                 "train with a name for each (algo.name), or report on them apart"
             )
+        here, there = (evaluation.described.get("trained_collision_weight", 1.0) for evaluation in (first, other))
+        if here != there:
+            raise UserInputError(
+                f"{first.folder} and {other.folder} are both of {agent[0]}, trained with collisions that count "
+                f"{here:g} times and {there:g} times: train with a name for each (algo.name), or report on them apart"
+            )
         here, there = _acting_of(first), _acting_of(other)
         if here != there:
             raise UserInputError(

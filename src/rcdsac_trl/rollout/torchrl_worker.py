@@ -17,7 +17,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.collectors._base import BaseCollector
 
-from rcdsac_trl.rollout.worker_processes import MakeDrive, RolloutRequest
+from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.rollout.worker_processes import Drive, MakeDrive, RolloutRequest
 from rcdsac_trl.system.interrupts import interruption_point
 
 T = TypeVar("T")
@@ -49,7 +50,12 @@ class WorkerCollector(BaseCollector):
         torch.set_num_threads(1)
         self.worker_idx = worker_idx
         self._stack = contextlib.ExitStack()
-        self._drive = self._stack.enter_context(create_env_fn[0]())
+        self._drive: Drive | None = None
+        self._refused: UserInputError | None = None
+        try:
+            self._drive = self._stack.enter_context(create_env_fn[0]())
+        except UserInputError as error:  # Ray tells of a process that cannot be made only by its traceback
+            self._refused = error
         self._request: RolloutRequest | None = None
         self._steps = 0.0
         self._shown = AT_REST
@@ -62,8 +68,11 @@ class WorkerCollector(BaseCollector):
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yield what was asked for last, ``[N, T]``."""
         while True:
+            if self._refused is not None:
+                raise self._refused
             if self._request is None:
                 raise RuntimeError("prepare() says what to drive, before each batch")
+            assert self._drive is not None  # else it was refused
             request, self._request = self._request, None
             driven = self._drive(request, self._count).tensordict()
             self._shown = AT_REST

@@ -150,6 +150,7 @@ def _told(settings: TrainingSettings, agent: NamedAgent, *, is_run: bool, has_te
         "measure": (trained.algo.distortion.name, settings.algo.distortion.name),
         "sensor": (trained.sensor.name, settings.sensor.name),
         "robot": (trained.robot.name, settings.robot.name),
+        "what a collision counts": (f"{trained.algo.fixed_weight:g}", f"{settings.algo.fixed_weight:g}"),
     }
     changed = [f"{what} {was} becomes {now}" for what, (was, now) in pairs.items() if was != now]
     return f"begin with {settings.init}; not copied: {', '.join(left)}" + "".join(f"; {change}" for change in changed)

@@ -128,8 +128,7 @@ def driving_section(measured: Measured) -> str:
         f"Means of {measured.num_episodes} episodes of {told['task']['episode_steps']} steps on {told['num_maps']} "
         f"{told['split']} maps (seed {told['seed']}; maps of version {measured.map_version},\nrules of version "
         f"{measured.rules_version}), which it was never trained on and never chosen by; {measured.confidence:.0%} "
-        "intervals with the map as the unit.\nIt drove alone: no stop zone, no detours, no watchdog. "
-        f"{_precision(measured)}",
+        f"intervals with the map as the unit.\n{_alone(told['task'])} {_precision(measured)}",
         _driving_table(measured).rstrip(),
         f"To measure it again on the same maps: `{measured.command}`.",
     ]
@@ -148,6 +147,18 @@ def driving_section(measured: Measured) -> str:
             f"predict:\n\n{_told_table(measured)}".rstrip()
         )
     return "\n\n".join(parts)
+
+
+def _alone(task: Mapping[str, Any]) -> str:
+    """Say what stood between the agent and the wheels while it was measured: what its task put there.
+
+    Example:
+        >>> _alone({"stop_zone_share": 0.5})
+        'A stop zone limited it in 50% of the episodes; it had neither detours nor a watchdog.'
+    """
+    if share := task.get("stop_zone_share", 0.0):
+        return f"A stop zone limited it in {share:.0%} of the episodes; it had neither detours nor a watchdog."
+    return "It drove alone: no stop zone, no detours, no watchdog."
 
 
 def _precision(measured: Measured) -> str:
@@ -244,7 +255,7 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
 def _written(value: Any) -> str:
     """Write where an agent comes from: a number that was learnt in so many digits as anybody compares."""
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 
 def _described(robot: RobotSettings) -> str:

@@ -4,6 +4,7 @@ It knows neither TorchRL nor Gymnasium: :mod:`rcdsac_trl.world.task.env` and
 :mod:`rcdsac_trl.world.task.gymnasium_env` are thin adapters over :class:`AgentGroup`.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
@@ -93,6 +94,8 @@ class AgentGroup(OfOneProcess):
             )
             for row, agent_id in enumerate(agent_ids)
         ]
+        if not 0.0 <= collision_weight < math.inf:
+            raise UserInputError(f"collision_weight={collision_weight} must be a number of at least 0: 1 is the task's")
         self._collision_weight = collision_weight
         self._mask = mask
         self._max_range_m = robot.lidar.max_range_m

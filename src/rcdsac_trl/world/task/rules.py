@@ -177,7 +177,7 @@ def combined(components: Any, collision_weight: Any = 1.0) -> Any:
 
     Args:
         components: array or tensor [..., 5], in the order of :data:`REWARD_COMPONENTS`.
-        collision_weight: w_coll; 1 but for RCWR.
+        collision_weight: w_coll; 1 unless a row says otherwise.
     """
     r = {name: components[..., i] for i, name in enumerate(REWARD_COMPONENTS)}
     return r["base"] + r["goal"] + r["waypoint"] * r["angular"] + collision_weight * r["collision"]
@@ -188,7 +188,7 @@ def total_reward(components: ArrayLike, collision_weight: float | NDArray[np.flo
 
     Args:
         components: [..., 5], from :func:`reward_components`.
-        collision_weight: w_coll; 1 but for RCWR.
+        collision_weight: w_coll; 1 unless a row says otherwise.
 
     Example:
         >>> float(total_reward([0.0, 10.0, 0.5, 0.5, -10.0], collision_weight=2.0))
