@@ -287,6 +287,19 @@ def test_a_weight_of_all_collisions_scales_the_collision_reward_and_is_told_to_n
     torch.testing.assert_close(heavy["reward"] - plain["reward"], 2.0 * plain["reward_components"][..., 4:])
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"collision_weight": -1.0}, r"collision_weight=-1.0 must be a number of at least 0"),
+        ({"collision_weight": math.nan}, "must be a number of at least 0"),
+        ({"collision_weight": 3.0, "weighted_collisions": True}, "collision_weight=3 is not for weighted_collisions"),
+    ],
+)
+def test_a_weight_that_means_nothing_is_refused(given: dict, told: str) -> None:
+    with pytest.raises(UserInputError, match=told):
+        NavigationEnv(map_settings=SMALL, agent_ids=(0,), **given)
+
+
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_a_reset_brings_a_collision_weight_or_one(num_workers: int) -> None:
     env = make_env(map_settings=SMALL, agent_ids=(0, 1), num_workers=num_workers, serial=True, weighted_collisions=True)

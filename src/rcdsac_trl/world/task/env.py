@@ -76,6 +76,10 @@ class NavigationEnv(OfOneProcess, EnvBase):
         collision_weight: float = 1.0,
         **changes: Any,
     ) -> None:
+        if weighted_collisions and collision_weight != 1.0:
+            raise UserInputError(
+                f"collision_weight={collision_weight:g} is not for weighted_collisions, which bring theirs: drop it"
+            )
         world, ids = _with_agents(world, agent_ids, {**changes, "num_workers": 0})
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([len(ids)]))
         self.agents = AgentGroup(
