@@ -30,6 +30,7 @@ accelerator is what ``benchmarks/accelerator.py`` wrote::
 
 import json
 import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -261,15 +262,14 @@ def _with_interval(found: Interval, form: str) -> str:
 
 def _averaged_conditions(episodes: Episodes, sensor: str) -> dict[str, list[pd.Series]]:
     """Return which conditions of each kind of agent are averaged, by its name; kinds that lack a setting: none."""
-    settings, kinds, found = averaged_settings(), dict[str, list[pd.Series]](), dict[str, set[Any]]()
+    settings, kinds = averaged_settings(), defaultdict[str, list[pd.Series]](list)
     here = episodes.conditions[episodes.conditions["sensor"] == sensor]
     for _, condition in here[here["beta_controller"].isna()].iterrows():
         name, measure = called(condition["agent"])
-        setting = measure, condition["beta"]
-        if pd.isna(condition["beta"]) or setting in settings:
-            kinds.setdefault(name, []).append(condition)
-            found.setdefault(name, set()).update(() if pd.isna(condition["beta"]) else (setting,))
-    return {name: kind for name, kind in kinds.items() if len(found[name]) in (0, len(settings))}
+        if pd.isna(condition["beta"]) or (measure, condition["beta"]) in settings:
+            kinds[name].append(condition)
+    with_beta = {name: sum(pd.notna(each["beta"]) for each in kind) for name, kind in kinds.items()}
+    return {name: kind for name, kind in kinds.items() if with_beta[name] in (0, len(settings))}
 
 
 def table_of_course(folder: Path) -> str:
@@ -372,18 +372,15 @@ def accelerator_table(values: Mapping[str, Any] | None) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in (("part", "", ""), ("---",) * 3, *rows))
 
 
-def _renewed_card(card: Path) -> str:
+def _card_in(folder: Path) -> str:
     """Return the card of a shipped agent, as ``publish`` would write it today."""
-    weights = read_weights(card.parent)
+    weights = read_weights(folder)
     return card_of(weights, weights.measured)
 
 
 if __name__ == "__main__":
-    for documents, write in (
-        (DOCUMENTS, lambda page: renewed(page.read_text(encoding="utf-8"))),
-        (CARDS, _renewed_card),
-    ):
-        for document in documents:
-            if (new := write(document)) != document.read_text(encoding="utf-8"):
-                document.write_text(new, encoding="utf-8")
-                print(f"{document.relative_to(ROOT)}: written anew")
+    for document in (*DOCUMENTS, *CARDS):
+        text = document.read_text(encoding="utf-8")
+        if (new := _card_in(document.parent) if document in CARDS else renewed(text)) != text:
+            document.write_text(new, encoding="utf-8")
+            print(f"{document.relative_to(ROOT)}: written anew")

@@ -35,7 +35,7 @@ class DistortionSettings:
         return make_measure(self.name, self.low, self.high)
 
 
-# A collision of -10 then costs what an episode earns in a lifetime; larger is a slip.
+# A collision then costs 10,000, an episode earns about 550: larger is a slip.
 _LARGEST_WEIGHT = 1000.0
 
 
@@ -88,13 +88,10 @@ class AlgoSettings:
         object.__setattr__(self, "evaluation_collision_weights", weights)
         if bool(weights) != (self.told_weights is not None):
             given = None if self.collision_weight is None else list(self.collision_weight)
+            told_none = "nobody is told a weight, so give [], and a name (algo.name)"
             raise UserInputError(
                 f"algo.evaluation_collision_weights={list(weights)} does not go with algo.collision_weight={given}: "
-                + (
-                    "nobody is told a weight, so give [], and a name (algo.name)"
-                    if weights
-                    else "give some of the range"
-                )
+                f"{told_none if weights else 'give some of the range'}"
             )
         if weights and self.conditioning == "per_episode":
             raise UserInputError(
