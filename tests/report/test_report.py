@@ -16,6 +16,7 @@ from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.report import __main__ as command
 from rcdsac_trl.report import collision_report, findings, statistics, table
 from rcdsac_trl.report.comparison_figures import collision_causes, paired_differences
+from rcdsac_trl.report.evaluation_folders import find_evaluations, runs_among
 from rcdsac_trl.report.evaluation_summary import summarised
 from rcdsac_trl.report.learning import validation_of_runs
 from rcdsac_trl.report.learning_figures import learning_curves
@@ -643,6 +644,24 @@ def test_the_command_refuses_before_it_writes(
     assert left.value.code == 2
     assert "there is no folder nowhere: name runs" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_runs_stands_for_those_that_were_evaluated(tmp_path: Path) -> None:
+    evaluated, other, single = (
+        tmp_path / name for name in ("sweep/b/evaluation/last", "sweep/a/evaluation/best", "of/a/baseline")
+    )
+    for folder in (evaluated, other, single):
+        folder.mkdir(parents=True)
+        (folder / "evaluation.json").write_text("{}")
+    (tmp_path / "sweep" / "training" / "evaluation").mkdir(parents=True)
+    (tmp_path / "sweep" / "notes.md").touch()
+    sweep = tmp_path / "sweep"
+    # A run, an evaluation and what is not there stay; evaluations deeper down are another folder's.
+    named = [sweep, sweep / "a", evaluated, tmp_path / "of", tmp_path / "nowhere"]
+    assert runs_among(named) == [sweep / "a", sweep / "b", *named[1:]]
+    assert find_evaluations(runs_among([sweep])) == [other, evaluated]
+    with pytest.raises(UserInputError, match=r"of holds no evaluation\.json"):
+        find_evaluations(runs_among([tmp_path / "of"]))
 
 
 def test_a_run_that_logged_no_time_is_drawn_over_its_updates(tmp_path: Path) -> None:

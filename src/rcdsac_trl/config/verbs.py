@@ -73,7 +73,7 @@ VERBS = {
         examples={
             "runs=[runs/<a>,runs/<b>]": "two runs, with all that was evaluated of them",
             "runs=[runs/<a>,evaluation/<baseline>] out=mine": "a run against a baseline, into the folder `mine`",
-            "runs=[results/rcdsac_pow-narrow,results/sac-narrow]": "shipped agents, in a checkout",
+            "runs=[results,results/seed-1,results/seed-2]": "all trainings of the paper's rows, in a checkout",
         },
     ),
     "plot_training": Verb(

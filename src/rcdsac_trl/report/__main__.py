@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from rcdsac_trl.cli import Command
 from rcdsac_trl.errors import UserInputError
-from rcdsac_trl.report.evaluation_folders import find_evaluations, is_course
+from rcdsac_trl.report.evaluation_folders import find_evaluations, is_course, runs_among
 from rcdsac_trl.report.folder import check_report_folder
 from rcdsac_trl.system.progress import Work
 from rcdsac_trl.system.resources import check_out
@@ -43,7 +43,7 @@ def make_report(cfg: DictConfig) -> Report:
     """Read evaluations; refuses what cannot be compared, before anything is written."""
     runs = cfg.runs
     named = [runs] if isinstance(runs, str) else list(runs or [])
-    folders = [Path(str(run)) for run in named]
+    folders = runs_among([Path(str(run)) for run in named])
     out = Path(str(cfg.out))
     check_out(out)
     check_report_folder(out)

@@ -14,6 +14,22 @@ COURSE = "course.json"
 """The same of drives over the office course."""
 
 
+def runs_among(folders: Sequence[Path]) -> list[Path]:
+    """Return some folders, the evaluated runs in it instead of one that holds nothing but runs.
+
+    Args:
+        folders: as a user names them; those that are not there, or hold no evaluated run, stay as they are.
+    """
+    return [run for folder in folders for run in (_evaluated_runs_in(folder) or [folder])]
+
+
+def _evaluated_runs_in(folder: Path) -> list[Path]:
+    """Return the runs of a folder that have evaluations; none if it is a run, or an evaluation, itself."""
+    if any(folder.glob("evaluation/*")) or any((folder / name).is_file() for name in (DESCRIPTION, BARN, COURSE)):
+        return []
+    return sorted({path.parents[2] for path in folder.glob(f"*/evaluation/*/{DESCRIPTION}")})
+
+
 def find_evaluations(folders: Sequence[Path]) -> list[Path]:
     """Return the evaluations among and in some folders.
 
@@ -28,7 +44,7 @@ def find_evaluations(folders: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for folder in folders:
         if not os.path.isdir(folder):  # false for a name that is too long, too
-            raise UserInputError(f"there is no folder {folder}: name runs, or evaluations of them")
+            raise UserInputError(f"there is no folder {folder}: name runs, evaluations of them, or a folder of runs")
         inside = [folder] if (folder / DESCRIPTION).is_file() else []
         inside += sorted(path.parent for path in folder.glob(f"evaluation/*/{DESCRIPTION}"))
         if not inside and (folder / BARN).is_file():
