@@ -30,7 +30,6 @@ accelerator is what ``benchmarks/accelerator.py`` wrote::
 
 import json
 import re
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -41,14 +40,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.policy.weights import card_of, read_weights
+from rcdsac_trl.report.averages import FIRST, averages, trainings_told
 from rcdsac_trl.report.card import measured_values
 from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_table import course_table
 from rcdsac_trl.report.findings import labels
 from rcdsac_trl.report.read import Episodes, read_episodes
-from rcdsac_trl.report.rows import called, condition_label, paper_table, row_label
+from rcdsac_trl.report.rows import condition_label, paper_table, row_label
 from rcdsac_trl.report.statistics import Interval, Term, compare, contrast
-from rcdsac_trl.report.table import averaged_settings, comparison
+from rcdsac_trl.report.table import comparison
 from rcdsac_trl.report.training_errors import TrainingErrors
 from rcdsac_trl.report.verdict_words import numbers, of_agents
 from rcdsac_trl.report.verdicts import Finding
@@ -63,8 +63,6 @@ _COURSE_HEADINGS = (
     *("agent", "β", "forward: arrived", "collisions a run", "time, s"),
     *("in reverse: arrived", "collisions a run", "time, s"),
 )
-# What the others are compared with where kinds of agents are averaged.
-_FIRST = "RC-DSAC (resample)"
 _HEADINGS = ("agent", "collisions", "reward", "episodes without collision", "goals")
 
 
@@ -220,56 +218,32 @@ def table_of_averages(episodes: Episodes, sensors: Sequence[str]) -> str:
         episodes: of all of them.
         sensors: two columns each.
     """
-    errors = TrainingErrors(episodes)
-    columns = [_averages_of(episodes, errors, sensor) for sensor in sensors]
-    headings = [heading for sensor in sensors for heading in (f"{sensor}: collisions / reward", f"{_FIRST} from it")]
-    order = list(dict.fromkeys(paper_table()["name"]))  # what the paper lacks comes last
-    names = sorted({name for column in columns for name in column}, key=lambda name: (*order, name).index(name))
+    means = averages(episodes)
+    order = [*dict.fromkeys(paper_table()["name"]), *means["name"]]  # what the paper lacks comes last
+    columns = [_averages_with(means[means["sensor"] == sensor]) for sensor in sensors]
+    headings = [heading for sensor in sensors for heading in (f"{sensor}: collisions / reward", f"{FIRST} from it")]
+    names = [name for name in dict.fromkeys(order) if any(name in column for column in columns)]
     return _markdown(
         ["averaged", *headings], [[name, *(c for of in columns for c in of.get(name, ("", "")))] for name in names]
     )
 
 
-def _averages_of(episodes: Episodes, errors: TrainingErrors, sensor: str) -> dict[str, tuple[str, str]]:
-    """Return each kind's means with a sensor, and what RC-DSAC (resample) has more."""
-    kinds = _averaged_conditions(episodes, sensor)
+def _averages_with(means: pd.DataFrame) -> dict[str, tuple[str, str]]:
+    """Return each kind's means with a sensor, and what RC-DSAC (resample) has more, by its name."""
     cells = {}
-    for name, conditions in kinds.items():
-        means, more = [], []
-        for metric, form in (("collisions", ".2f"), ("reward", ".0f")):
-            means.append(f"{np.mean([episodes.of(each, metric).mean() for each in conditions]):{form}}")
-            if name == _FIRST or _FIRST not in kinds:
-                continue
-            sides = [(sign / len(of), each) for sign, of in ((1, kinds[_FIRST]), (-1, conditions)) for each in of]
-            terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]
-            more.append(_with_interval(contrast(terms, error=errors.of_sum(sides, metric)), form))
-        cells[name] = " / ".join(means) + _trainings_of(episodes, conditions), ", ".join(more)
+    for _, row in means.iterrows():
+        trainings = f" ({told})" if (told := trainings_told(row)) else ""
+        more = [
+            _with_interval(Interval(*(row[f"{metric}_from{part}"] for part in ("", "_low", "_high"))), form)
+            for metric, form in (("collisions", ".2f"), ("reward", ".0f"))
+            if pd.notna(row[f"{metric}_from"])
+        ]
+        cells[row["name"]] = f"{row['collisions']:.2f} / {row['reward']:.0f}{trainings}", ", ".join(more)
     return cells
-
-
-def _trainings_of(episodes: Episodes, conditions: Sequence[pd.Series]) -> str:
-    """Say how many trainings some conditions are of, `` (1 to 2)``; of planners nothing."""
-    trained = set(episodes.table.loc[episodes.table["trained"], "agent"])
-    numbers = [len(episodes.of(each, "reward")) for each in conditions if each["agent"] in trained]
-    if not numbers:
-        return ""
-    return f" ({min(numbers)})" if min(numbers) == max(numbers) else f" ({min(numbers)} to {max(numbers)})"
 
 
 def _with_interval(found: Interval, form: str) -> str:
     return f"{found.value:{form}} [{found.low:{form}}, {found.high:{form}}]"
-
-
-def _averaged_conditions(episodes: Episodes, sensor: str) -> dict[str, list[pd.Series]]:
-    """Return which conditions of each kind of agent are averaged, by its name; kinds that lack a setting: none."""
-    settings, kinds = averaged_settings(), defaultdict[str, list[pd.Series]](list)
-    here = episodes.conditions[episodes.conditions["sensor"] == sensor]
-    for _, condition in here[here["beta_controller"].isna()].iterrows():
-        name, measure = called(condition["agent"])
-        if pd.isna(condition["beta"]) or (measure, condition["beta"]) in settings:
-            kinds[name].append(condition)
-    with_beta = {name: sum(pd.notna(each["beta"]) for each in kind) for name, kind in kinds.items()}
-    return {name: kind for name, kind in kinds.items() if with_beta[name] in (0, len(settings))}
 
 
 def table_of_course(folder: Path) -> str:

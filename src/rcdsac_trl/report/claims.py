@@ -10,10 +10,11 @@ from collections.abc import Iterator, Sequence
 
 import pandas as pd
 
+from rcdsac_trl.report.averages import averaged_rows
 from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.rows import condition_label, paper_table
 from rcdsac_trl.report.statistics import Array
-from rcdsac_trl.report.table import SENSORS, averaged_settings
+from rcdsac_trl.report.table import SENSORS
 from rcdsac_trl.report.training_errors import TrainingErrors
 from rcdsac_trl.report.training_scatter import TrainingError
 from rcdsac_trl.report.verdicts import Cell, Claim, Expectation, Finding, Group, Measured, find, than
@@ -87,7 +88,7 @@ class _Rows:
 
     def _fewest(self) -> Iterator[Claim]:
         mean = self.average(_RESAMPLE)
-        others = (self.average(_DSAC), self.average(_STORED), self.all_of(_RCWR), self.all_of(_SAC))
+        others = (self.average(_DSAC), self.average(_STORED), self.average(_RCWR), self.average(_SAC))
         yield self._claim(
             "RC-DSAC (resample) collides least, averaged", *(than(mean, "less", other) for other in others)
         )
@@ -108,12 +109,12 @@ class _Rows:
             )
 
     def _sac(self) -> Iterator[Claim]:
-        sac = self.all_of(_SAC)
+        sac = self.average(_SAC)
         rows = [row for name in _RISK_SENSITIVE for row in self.each_of(name)]
         yield self._claim(
             "SAC collides most: every row of RC-DSAC and DSAC collides less", *(than(row, "less", sac) for row in rows)
         )
-        yield self._claim("RCWR collides less than SAC", than(self.all_of(_RCWR), "less", sac))
+        yield self._claim("RCWR collides less than SAC", than(self.average(_RCWR), "less", sac))
         yield self._claim(
             "Some rows of RC-DSAC or DSAC earn more than SAC",
             *(than(row, "more", sac, "reward") for row in rows),
@@ -166,15 +167,9 @@ class _Rows:
             )
 
     def average(self, name: str) -> Group:
-        """Average over both measures at the settings DSAC has, as the paper's text does."""
-        wanted = averaged_settings()
-        rows = self._table[self._table["name"] == name]
-        here = pd.MultiIndex.from_frame(rows[["psi", "beta"]]).isin(wanted)
-        return Group(name, tuple(_cell(row) for _, row in rows[here].iterrows()))
-
-    def all_of(self, name: str) -> Group:
-        """Average over all rows of a name."""
-        return Group(name, tuple(cell for group in self.each_of(name) for cell in group.cells))
+        """Average over the rows of a name that the paper's text averages."""
+        rows = averaged_rows(self._table)[name, self.sensor]
+        return Group(name, tuple(_cell(row) for _, row in rows.iterrows()))
 
     def each_of(self, name: str) -> list[Group]:
         """Return the rows of a name, each for itself."""
@@ -195,8 +190,7 @@ def _between_sensors() -> list[Claim]:
     narrow, sparse = (_Rows(sensor) for sensor in SENSORS)
 
     def means(rows: _Rows, name: str) -> Group:
-        group = rows.average(name) if name in _RISK_SENSITIVE else rows.all_of(name)
-        return Group(f"{name} {rows.sensor}", group.cells)
+        return Group(f"{name} {rows.sensor}", rows.average(name).cells)
 
     return [
         Claim(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from rcdsac_trl.report import collision_report, findings, learning, rows, table
+from rcdsac_trl.report import averages, collision_report, findings, learning, table
 from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_claims import judged_course_claims
 from rcdsac_trl.report.course_table import course_table
@@ -53,8 +53,8 @@ class Results:
     @cached_property
     def averages(self) -> pd.DataFrame:
         """The averages of the paper's text, of its table and of ours."""
-        own = table.averages(table.own_table(self.episodes)).assign(source="here")
-        return pd.concat([table.averages(rows.paper_table()).assign(source="paper"), own])
+        own = averages.averages(self.episodes).assign(source="here")
+        return pd.concat([averages.paper_averages().assign(source="paper"), own])
 
     @cached_property
     def summary(self) -> pd.DataFrame:

@@ -72,10 +72,5 @@ def called(agent: str) -> tuple[str, str]:
 
 @cache
 def _called() -> dict[str, tuple[str, str]]:
-    rows = names_of_rows().fillna("").itertuples(index=False)
+    rows = paper_table()[["agent", "name", "psi"]].drop_duplicates().fillna("").itertuples(index=False)
     return _BEYOND_THE_PAPER | {agent: (name, measure) for agent, name, measure in rows}
-
-
-def names_of_rows() -> pd.DataFrame:
-    """Return what the paper calls each of our rows, and the row's measure."""
-    return paper_table()[["agent", "name", "psi"]].drop_duplicates()

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import pandas as pd
 
 from rcdsac_trl.report import collision_report, findings, table
+from rcdsac_trl.report.averages import FIRST, trainings_told
 from rcdsac_trl.report.comparison_figures import collision_causes, paired_differences
 from rcdsac_trl.report.course_claims import COURSE
 from rcdsac_trl.report.course_table import DIRECTIONS
@@ -157,7 +158,7 @@ def _paper(results: Results) -> list[Part]:
         parts.append(Folded("Rows of the paper's table that were not measured", [f"{line}." for line in lacking]))
     parts += [
         Heading("Averaged as in the paper's text"),
-        "Over both risk measures, at the two settings of each that DSAC has.",
+        "Over both risk measures, at the two settings of each that DSAC has; RCWR over its weights.",
         _averages(results.averages),
     ]
     return parts
@@ -190,18 +191,28 @@ def _named(rows: pd.DataFrame) -> list[str]:
 
 def _averages(means: pd.DataFrame) -> pd.DataFrame:
     """Lay averages out with a row an agent and sensor, ours beside the paper's."""
-    wide = means.pivot(index=["name", "sensor"], columns="source", values=list(table.TABULATED))
-    order = means[["name", "sensor"]].drop_duplicates().itertuples(index=False, name=None)
-    wide = wide.loc[list(order)]
+    keys = ["name", "sensor"]
+    here, paper = (means[means["source"] == source] for source in ("here", "paper"))
+    paper = paper[[*keys, *table.TABULATED]].rename(columns={metric: f"{metric}_paper" for metric in table.TABULATED})
+    rows = means[keys].drop_duplicates().merge(here, how="left", on=keys).merge(paper, how="left", on=keys)
     columns: dict[tuple[str, str], list[str]] = {
-        ("", "agent"): wide.index.get_level_values("name").tolist(),
-        ("", "sensor"): wide.index.get_level_values("sensor").tolist(),
+        ("", "agent"): rows["name"].tolist(),
+        ("", "sensor"): rows["sensor"].tolist(),
+        ("", "trainings"): [trainings_told(row) for _, row in rows.iterrows()],
     }
     for metric in table.TABULATED:
-        for source in ("here", "paper"):
-            values = wide.get((metric, source), pd.Series(float("nan"), wide.index))
-            columns[heading(metric), source] = [number(value, metric) for value in values]
+        title = heading(metric)
+        columns[title, "here"] = [number(value, metric) for value in rows[metric]]
+        columns[title, CONFIDENCE_TEXT] = _told_intervals(rows, metric, metric)
+        columns[title, f"{FIRST} from it"] = _told_intervals(rows, f"{metric}_from", metric, signed=True)
+        columns[title, "paper"] = [number(value, metric) for value in rows[f"{metric}_paper"]]
     return pd.DataFrame(columns)
+
+
+def _told_intervals(rows: pd.DataFrame, key: str, metric: str, signed: bool = False) -> list[str]:
+    """Write the intervals of a column, nothing where there is none."""
+    pairs = zip(rows[f"{key}_low"], rows[f"{key}_high"], strict=True)
+    return ["" if pd.isna(low) else interval(low, high, metric, signed) for low, high in pairs]
 
 
 def _course(results: Results) -> list[Part]:

@@ -7,7 +7,7 @@ import pandas as pd
 
 from rcdsac_trl.report.formats import interval, number
 from rcdsac_trl.report.read import Episodes, possible
-from rcdsac_trl.report.rows import called, condition_label, names_of_rows, paper_table
+from rcdsac_trl.report.rows import called, condition_label, paper_table
 from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, bootstrap
 from rcdsac_trl.report.training_errors import TrainingErrors
 
@@ -33,7 +33,7 @@ def own_table(episodes: Episodes) -> pd.DataFrame:
             bounds = (found.low, found.high) if values.shape[1] > 1 else (np.nan, np.nan)  # one map tells none
             row |= dict(zip((f"{metric}_low", f"{metric}_high"), bounds, strict=True))
         rows.append(row)
-    return pd.DataFrame(rows).merge(names_of_rows(), on="agent", how="left")
+    return pd.DataFrame(rows)
 
 
 def missing_rows(episodes: Episodes) -> dict[str, list[str]]:
@@ -49,31 +49,6 @@ def missing_rows(episodes: Episodes) -> dict[str, list[str]]:
         ]
         for sensor in SENSORS
     }
-
-
-def averages(table: pd.DataFrame) -> pd.DataFrame:
-    """Average over both measures, at the two settings each that the paper evaluates DSAC at, as its text does.
-
-    Args:
-        table: from :func:`paper_table` or :func:`own_table`.
-
-    Returns:
-        `name`, `sensor`, `collisions` and `reward`, for each name of which all four rows are there.
-    """
-    wanted = averaged_settings()
-    rows = []
-    for (name, sensor), part in table.groupby(["name", "sensor"], sort=False):
-        found = part.set_index(["psi", "beta"])
-        if wanted.isin(found.index).all():
-            means = found.loc[wanted, ["collisions_mean", "reward_mean"]].mean()
-            rows.append((name, sensor, means["collisions_mean"], means["reward_mean"]))
-    return pd.DataFrame(rows, columns=["name", "sensor", "collisions", "reward"])
-
-
-def averaged_settings() -> pd.MultiIndex:
-    """Return measure and setting of what the paper's text averages over: where it evaluates DSAC."""
-    paper = paper_table()
-    return pd.MultiIndex.from_frame(paper[paper["name"] == "DSAC"][["psi", "beta"]].drop_duplicates())
 
 
 def _pairs(table: pd.DataFrame) -> list[tuple[str, str]]:
