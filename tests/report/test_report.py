@@ -569,6 +569,10 @@ def test_a_report_is_one_page_that_fetches_nothing(tmp_path: Path) -> None:
         "collision_causes.png",
         "report.html",
     }
+    averages = pd.read_csv(out / "averages.csv")
+    own = averages[averages["source"] == "here"]
+    assert own["name"].tolist() == ["SAC"]  # of RC-DSAC's settings CVaR's were not driven
+    assert own["collisions_from"].isna().all()
     text = (out / "report.html").read_text()
     page = Images()
     page.feed(text)
