@@ -47,7 +47,7 @@ from rcdsac_trl.report.course_table import course_table
 from rcdsac_trl.report.findings import labels
 from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.report.rows import condition_label, paper_table, row_label
-from rcdsac_trl.report.statistics import Interval, Term, compare, contrast
+from rcdsac_trl.report.statistics import Interval, compare
 from rcdsac_trl.report.table import comparison
 from rcdsac_trl.report.training_errors import TrainingErrors
 from rcdsac_trl.report.verdict_words import numbers, of_agents
@@ -200,9 +200,8 @@ def table_of_differences(episodes: Episodes, names: Sequence[str]) -> str:
                     cells += ["", ""]
                     continue
                 for metric, form in (("collisions", ".2f"), ("reward", ".0f")):
-                    sides = ((1.0, condition), (-1.0, other))
-                    terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]
-                    cells.append(_with_interval(contrast(terms, error=errors.between(condition, other, metric)), form))
+                    more = errors.contrast([(1.0, condition), (-1.0, other)], metric)
+                    cells.append(_with_interval(more, form))
             rows.append(cells)
     headings = [f"{metric}, from {row_label(each['agent'])}" for each in against for metric in ("collisions", "reward")]
     return _markdown(["agent", *headings], rows)

@@ -6,14 +6,13 @@ Actor-Critic for Risk-Sensitive Navigation*.
 
 import math
 
-import numpy as np
 import pandas as pd
 
 from rcdsac_trl.report.read import Episodes, possible
 from rcdsac_trl.report.rows import called, paper_table
-from rcdsac_trl.report.statistics import Interval, Term, contrast
+from rcdsac_trl.report.statistics import Interval
 from rcdsac_trl.report.table import TABULATED
-from rcdsac_trl.report.training_errors import Terms, TrainingErrors
+from rcdsac_trl.report.training_errors import TrainingErrors
 
 FIRST = "RC-DSAC (resample)"
 """What the others are compared with."""
@@ -37,12 +36,14 @@ def averaged_rows(rows: pd.DataFrame) -> dict[tuple[str, str], pd.DataFrame]:
     paper = paper_table()
     dsac = paper[paper["name"] == "DSAC"]
     settings = set(zip(dsac["psi"], dsac["beta"], strict=True))
-    kinds, betas = rows["agent"].map(lambda agent: called(agent)[0]), zip(rows["agent"], rows["beta"], strict=True)
-    kept = np.array([pd.isna(beta) or (called(agent)[1], beta) in settings for agent, beta in betas])
-    groups = rows[kept].groupby([kinds[kept], "sensor"], sort=False)
+    names = [called(agent) for agent in rows["agent"]]
+    kept = [
+        pd.isna(beta) or (measure, beta) in settings for (_, measure), beta in zip(names, rows["beta"], strict=True)
+    ]
+    kinds = pd.Series([kind for kind, _ in names], rows.index)
     return {
-        (str(name), str(sensor)): of_kind
-        for (name, sensor), of_kind in groups
+        (str(kind), str(sensor)): of_kind
+        for (kind, sensor), of_kind in rows[kept].groupby([kinds[kept], "sensor"], sort=False)
         if of_kind["beta"].notna().sum() in (0, len(settings))
     }
 
@@ -68,11 +69,11 @@ def averages(episodes: Episodes) -> pd.DataFrame:
     for (name, sensor), of_kind in kinds.items():
         row: dict[str, object] = {"name": name, "sensor": sensor} | _trainings(episodes, of_kind)
         for metric in TABULATED:
-            found = _contrast(episodes, errors, _share(of_kind, 1.0), metric).within(*possible(metric))
+            found = errors.contrast(_share(of_kind, 1.0), metric).within(*possible(metric))
             more = _NOTHING
             if name != FIRST and (FIRST, sensor) in kinds:
                 sides = [*_share(kinds[FIRST, sensor], 1.0), *_share(of_kind, -1.0)]
-                more = _contrast(episodes, errors, sides, metric)
+                more = errors.contrast(sides, metric)
             for key, of in ((metric, found), (f"{metric}_from", more)):
                 row |= {key: of.value, f"{key}_low": of.low, f"{key}_high": of.high}
         rows.append(row)
@@ -82,11 +83,6 @@ def averages(episodes: Episodes) -> pd.DataFrame:
 def _share(conditions: pd.DataFrame, weight: float) -> list[tuple[float, pd.Series]]:
     """Share a weight out over some conditions."""
     return [(weight / len(conditions), condition) for _, condition in conditions.iterrows()]
-
-
-def _contrast(episodes: Episodes, errors: TrainingErrors, sides: Terms, metric: str) -> Interval:
-    terms = [Term(weight, episodes.of(each, metric), each["agent"]) for weight, each in sides]
-    return contrast(terms, error=errors.of_sum(sides, metric))
 
 
 def _trainings(episodes: Episodes, conditions: pd.DataFrame) -> dict[str, object]:

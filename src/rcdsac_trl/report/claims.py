@@ -72,6 +72,7 @@ class _Rows:
         self.sensor = sensor
         table = paper_table()
         self._table = table[table["sensor"] == sensor]
+        self._rows_averaged = averaged_rows(self._table)
 
     def claims(self) -> list[Claim]:
         """Return the claims in the order of the paper's text, the main one first."""
@@ -168,8 +169,7 @@ class _Rows:
 
     def average(self, name: str) -> Group:
         """Average over the rows of a name that the paper's text averages."""
-        rows = averaged_rows(self._table)[name, self.sensor]
-        return Group(name, tuple(_cell(row) for _, row in rows.iterrows()))
+        return Group(name, tuple(_cell(row) for _, row in self._rows_averaged[name, self.sensor].iterrows()))
 
     def each_of(self, name: str) -> list[Group]:
         """Return the rows of a name, each for itself."""

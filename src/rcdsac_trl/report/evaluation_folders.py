@@ -15,7 +15,7 @@ COURSE = "course.json"
 
 
 def runs_among(folders: Sequence[Path]) -> list[Path]:
-    """Return some folders, the evaluated runs in it instead of one that holds nothing but runs.
+    """Return some folders, with the evaluated runs of each folder of runs in its place.
 
     Args:
         folders: as a user names them; those that are not there, or hold no evaluated run, stay as they are.

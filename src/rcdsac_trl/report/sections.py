@@ -203,16 +203,10 @@ def _averages(means: pd.DataFrame) -> pd.DataFrame:
     for metric in table.TABULATED:
         title = heading(metric)
         columns[title, "here"] = [number(value, metric) for value in rows[metric]]
-        columns[title, CONFIDENCE_TEXT] = _told_intervals(rows, metric, metric)
-        columns[title, f"{FIRST} from it"] = _told_intervals(rows, f"{metric}_from", metric, signed=True)
+        columns[title, CONFIDENCE_TEXT] = table.intervals(rows, metric)
+        columns[title, f"{FIRST} from it"] = table.intervals(rows, metric, "_from", signed=True)
         columns[title, "paper"] = [number(value, metric) for value in rows[f"{metric}_paper"]]
     return pd.DataFrame(columns)
-
-
-def _told_intervals(rows: pd.DataFrame, key: str, metric: str, signed: bool = False) -> list[str]:
-    """Write the intervals of a column, nothing where there is none."""
-    pairs = zip(rows[f"{key}_low"], rows[f"{key}_high"], strict=True)
-    return ["" if pd.isna(low) else interval(low, high, metric, signed) for low, high in pairs]
 
 
 def _course(results: Results) -> list[Part]:

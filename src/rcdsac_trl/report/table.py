@@ -75,7 +75,7 @@ def comparison(episodes: Episodes) -> pd.DataFrame:
         )
         for metric in TABULATED:
             out[(sensor, metric)] = _spreads(of_own, metric)
-            out[(sensor, f"{metric}, {CONFIDENCE_TEXT}")] = _intervals(of_own, metric)
+            out[(sensor, f"{metric}, {CONFIDENCE_TEXT}")] = intervals(of_own, metric)
             out[(sensor, f"{metric}, paper")] = _spreads(of_paper, metric)
     return out
 
@@ -86,9 +86,10 @@ def _spreads(rows: pd.DataFrame, metric: str) -> list[str]:
     return ["" if pd.isna(mean) else f"{number(mean, metric)} ± {number(std, metric)}" for mean, std in pairs]
 
 
-def _intervals(rows: pd.DataFrame, metric: str) -> list[str]:
-    pairs = zip(rows[f"{metric}_low"], rows[f"{metric}_high"], strict=True)
-    return ["" if pd.isna(low) else interval(low, high, metric) for low, high in pairs]
+def intervals(rows: pd.DataFrame, metric: str, of: str = "", signed: bool = False) -> list[str]:
+    """Write the intervals of a metric, or of what stands `of` behind its name; nothing where there is none."""
+    pairs = zip(rows[f"{metric}{of}_low"], rows[f"{metric}{of}_high"], strict=True)
+    return ["" if pd.isna(low) else interval(low, high, metric, signed) for low, high in pairs]
 
 
 def write_table(table: pd.DataFrame, stem: Path) -> None:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.rows import has_dial
-from rcdsac_trl.report.statistics import Array, Statistic, mean
+from rcdsac_trl.report.statistics import Array, Interval, Statistic, Term, contrast, mean
 from rcdsac_trl.report.training_scatter import TrainingError, TrainingScatter
 
 Recipe = tuple[str, str, float | None]
@@ -75,6 +75,11 @@ class TrainingErrors:
             of_sensor = [(weight, condition) for weight, condition in terms if condition["sensor"] == sensor]
             error += self._of_sensor(self._table(sensor, metric, statistic), of_sensor)
         return error
+
+    def contrast(self, terms: Terms, metric: str) -> Interval:
+        """Return a weighted sum of the means of conditions, and its interval over maps and trainings."""
+        sides = [Term(weight, self._episodes.of(condition, metric), condition["agent"]) for weight, condition in terms]
+        return contrast(sides, error=self.of_sum(terms, metric))
 
     def same(self, first: pd.Series, second: pd.Series) -> bool:
         """Say whether two conditions were driven by agents of the same trainings."""
