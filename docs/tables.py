@@ -44,6 +44,7 @@ from rcdsac_trl.report.averages import FIRST, averages, trainings_told
 from rcdsac_trl.report.card import measured_values
 from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_table import course_table
+from rcdsac_trl.report.evaluation_folders import all_trainings
 from rcdsac_trl.report.findings import labels
 from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.report.rows import condition_label, paper_table, row_label
@@ -114,12 +115,7 @@ def _conditions(name: str) -> list[Mapping[str, Any]]:
 
 def _trainings(names: Sequence[str]) -> list[Episodes]:
     """Return what all trainings of each of some agents drove."""
-    return [read_episodes(_folders(name)) for name in names]
-
-
-def _folders(name: str) -> list[Path]:
-    """Return the folders of all trainings of an agent, or of a baseline."""
-    return [ROOT / "results" / name, *sorted((ROOT / "results").glob(f"seed-*/{name}"))]
+    return [read_episodes(all_trainings(ROOT / "results", name)) for name in names]
 
 
 def table_of_seeds(agents: Sequence[Episodes]) -> str:
@@ -155,7 +151,7 @@ def _paper() -> Episodes:
     names = {name for agent, beta in agents for name in (agent, f"{agent}_{beta:g}")} | {"mppi"}
     folders = sorted((ROOT / "results").glob("*-*"))
     chosen = [folder.name for folder in folders if folder.name.rpartition("-")[0] in names]
-    return read_episodes([training for name in chosen for training in _folders(name)])
+    return read_episodes([training for name in chosen for training in all_trainings(ROOT / "results", name)])
 
 
 @cache

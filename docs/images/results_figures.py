@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from rcdsac_trl.colors import LIGHT
 from rcdsac_trl.report.comparison_figures import paired_differences
+from rcdsac_trl.report.evaluation_folders import all_trainings
 from rcdsac_trl.report.panels import include_zero
 from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.report.response_figures import beta_response
@@ -51,20 +52,20 @@ def beta_trainings() -> Figure:
 
 def _draw_trainings(axes: Axes, metric: str, sensor: str) -> None:
     """Draw a line for each training and one for their mean, and level lines of who has no beta."""
-    trained = [_means(run, metric).dropna() for run in _trainings(f"rcdsac_cvar-{sensor}")]
+    trained = [_means(run, metric).dropna() for run in all_trainings(RESULTS, f"rcdsac_cvar-{sensor}")]
     by_training = pd.concat(trained, axis=1, join="inner")
     axes.plot(by_training, color=LIGHT.robot, linewidth=1.0, alpha=0.45)
     mean = by_training.mean(axis=1)
     axes.plot(mean, color=LIGHT.robot, linewidth=2.4, marker="o", markersize=6)
     others = {"SAC": ("sac", LIGHT.alarm, "--"), "MPPI": ("mppi", LIGHT.ink, ":")}
     levels = {
-        name: float(pd.concat([_means(run, metric) for run in _trainings(f"{agent}-{sensor}")]).mean())
+        name: float(pd.concat([_means(run, metric) for run in all_trainings(RESULTS, f"{agent}-{sensor}")]).mean())
         for name, (agent, _, _) in others.items()
     }
     for name, (_, color, line) in others.items():
         axes.axhline(levels[name], color=color, linestyle=line, linewidth=1.6)
     for beta in _BETAS_OF_DSAC:
-        of_one = pd.concat([_means(run, metric) for run in _trainings(f"dsac_cvar_{beta}-{sensor}")])
+        of_one = pd.concat([_means(run, metric) for run in all_trainings(RESULTS, f"dsac_cvar_{beta}-{sensor}")])
         axes.plot([beta] * len(of_one), of_one, color=LIGHT.goal, marker=".", markersize=5, linestyle="none", alpha=0.6)
         axes.plot(beta, of_one.mean(), color=LIGHT.goal, marker="D", markersize=7)
     texts = {name: (level, others[name][1]) for name, level in levels.items()}
@@ -88,11 +89,6 @@ def _label_at_the_right(axes: Axes, texts: dict[str, tuple[float, str]]) -> None
         axes.annotate(name, (1.01, level), xycoords=("axes fraction", "data"), va=va, fontsize=9, color=color)
 
 
-def _trainings(name: str) -> list[Path]:
-    """Return the folders of all trainings of an agent, or of a baseline."""
-    return [RESULTS / name, *sorted(RESULTS.glob(f"seed-*/{name}"))]
-
-
 def _means(run: Path, metric: str) -> pd.Series:
     """Return the mean of a metric at each beta; of who has none under NaN."""
     return _episodes(run).table.groupby("beta", dropna=False)[metric].mean()
@@ -109,7 +105,7 @@ def main() -> None:
     # An agent or a baseline a folder; those of the study lie deeper, or are called otherwise.
     narrow = sorted(RESULTS.glob("*-narrow"), key=lambda run: (place(run), run))
     compared = [run for run in narrow if not run.name.startswith(BESIDE)]
-    episodes = read_episodes([training for run in compared for training in _trainings(run.name)])
+    episodes = read_episodes([training for run in compared for training in all_trainings(RESULTS, run.name)])
     of_both_sensors = read_episodes([*narrow, *sorted(RESULTS.glob("*-sparse"))])
     reference = episodes.conditions["agent"].tolist().index(REFERENCE)
     figures: dict[str, Figure | None] = {

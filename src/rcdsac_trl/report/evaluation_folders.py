@@ -30,6 +30,16 @@ def _evaluated_runs_in(folder: Path) -> list[Path]:
     return sorted({path.parents[2] for path in folder.glob(f"*/evaluation/*/{DESCRIPTION}")})
 
 
+def all_trainings(results: Path, name: str) -> list[Path]:
+    """Return the folders of all trainings of an agent, or of a baseline, in a folder that ``publish`` wrote to.
+
+    Args:
+        results: with the first training's in ``<name>``, and others in ``seed-*/<name>``.
+        name: such as ``sac-narrow``.
+    """
+    return [results / name, *sorted(results.glob(f"seed-*/{name}"))]
+
+
 def find_evaluations(folders: Sequence[Path]) -> list[Path]:
     """Return the evaluations among and in some folders.
 
