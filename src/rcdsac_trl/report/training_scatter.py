@@ -13,6 +13,7 @@ resample hold, too: intervals are too wide rather than too narrow.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,10 +54,16 @@ class TrainingError:
         """
         if self.variance == 0.0:
             return np.zeros(number)
-        t = stats.t.ppf((np.arange(number) + 0.5) / number, self.freedom)
-        # Independent of the maps drawn.
-        drawn: Array = np.random.default_rng([0, _SEED]).permutation(t) * self.variance**0.5
-        return drawn
+        return _errors_of_one(self.freedom, number) * float(self.variance) ** 0.5
+
+
+# A report asks thousands of times, for a few degrees of freedom.
+@lru_cache(maxsize=32)
+def _errors_of_one(freedom: float, number: int) -> Array:
+    """Draw errors of variance 1, in an order that is independent of the maps drawn."""
+    t = stats.t.ppf((np.arange(number) + 0.5) / number, freedom)
+    drawn: Array = np.random.default_rng([0, _SEED]).permutation(t)
+    return drawn
 
 
 class TrainingScatter:
