@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -188,6 +189,20 @@ def test_a_cluster_without_room_is_told(cluster: Any) -> None:
         RayWorkers(lambda cores: makes, address=None, cores=1, timeout_s=1.0)
 
 
+@pytest.mark.slow
+def test_a_process_that_is_not_ready_in_time_is_told(cluster: Any) -> None:
+    from rcdsac_trl.rollout.ray_workers import RayWorkers
+    from rcdsac_trl.system.processes import WorkerError
+
+    @contextlib.contextmanager
+    def make() -> Iterator[Drive]:
+        time.sleep(600)
+        yield
+
+    with pytest.raises(WorkerError, match=r"^the Ray processes \(1\) were not ready within 3 s$"):
+        RayWorkers(lambda cores: {"agents 0": make}, address=None, cores=2, timeout_s=3)
+
+
 def test_wrong_input_that_is_found_as_a_worker_is_made_is_told_with_the_first_batch() -> None:
     @contextlib.contextmanager
     def make() -> Iterator[Drive]:
@@ -195,6 +210,7 @@ def test_wrong_input_that_is_found_as_a_worker_is_made_is_told_with_the_first_ba
         yield
 
     collector = WorkerCollector([make])
+    collector.prepare(RolloutRequest(0, 0, b""))
     with pytest.raises(UserInputError, match="no such maps"):
         collector.next()
 

@@ -48,7 +48,7 @@ class RayWorkers:
 
     Raises:
         FaultError: if there is no such cluster, or it cannot be made.
-        WorkerError: if the cluster has no room for the processes within that time.
+        WorkerError: if the cluster has no room for the processes within that time, or they are not ready by then.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class RayWorkers:
             room = placement_group([{"CPU": 1}] * len(makes), strategy="SPREAD")
             self._stack.callback(remove_placement_group, room)
             self._wait_for(room)
-            self._collector = _collector(list(makes.values()), room)
+            self._collector = self._started(list(makes.values()), room)
             self._stack.callback(self._collector.shutdown)
         except BaseException:
             self.close()
@@ -84,6 +84,12 @@ class RayWorkers:
                 raise WorkerError(
                     f"the Ray cluster had no room for {len(self._described)} processes within {self._timeout_s:g} s"
                 )
+
+    def _started(self, makes: Sequence[MakeDrive], room: PlacementGroup) -> RayCollector:
+        starting = beside(lambda: _collector(makes, room))
+        if watch(starting, dict, len(makes), self._timeout_s) is not None:
+            raise WorkerError(f"the Ray processes ({len(makes)}) were not ready within {self._timeout_s:g} s")
+        return starting.result()
 
     def ask(self, request: RolloutRequest) -> TensorDictBase:
         """See :class:`~rcdsac_trl.rollout.worker_processes.WorkerGroup`.

@@ -11,7 +11,8 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
-from typing import Any, TypeVar
+from functools import partial
+from typing import Any, NoReturn, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -50,12 +51,10 @@ class WorkerCollector(BaseCollector):
         torch.set_num_threads(1)
         self.worker_idx = worker_idx
         self._stack = contextlib.ExitStack()
-        self._drive: Drive | None = None
-        self._refused: UserInputError | None = None
         try:
-            self._drive = self._stack.enter_context(create_env_fn[0]())
+            self._drive: Drive = self._stack.enter_context(create_env_fn[0]())
         except UserInputError as error:  # Ray tells of a process that cannot be made only by its traceback
-            self._refused = error
+            self._drive = partial(_refuse, error)
         self._request: RolloutRequest | None = None
         self._steps = 0.0
         self._shown = AT_REST
@@ -68,11 +67,8 @@ class WorkerCollector(BaseCollector):
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yield what was asked for last, ``[N, T]``."""
         while True:
-            if self._refused is not None:
-                raise self._refused
             if self._request is None:
                 raise RuntimeError("prepare() says what to drive, before each batch")
-            assert self._drive is not None  # else it was refused
             request, self._request = self._request, None
             driven = self._drive(request, self._count).tensordict()
             self._shown = AT_REST
@@ -106,6 +102,11 @@ class WorkerCollector(BaseCollector):
         """Take nothing."""
 
 
+def _refuse(error: UserInputError, request: RolloutRequest, before_step: Callable[[], None]) -> NoReturn:
+    """Drive nothing, as asked of a worker that could not be made."""
+    raise error
+
+
 def beside(call: Callable[[], T]) -> Future[T]:
     """Call something in a thread that ends with the program, whatever it waits for."""
     future: Future[T] = Future()
@@ -123,17 +124,17 @@ def beside(call: Callable[[], T]) -> Future[T]:
 def watch(
     waiting: Future[Any], steps: Callable[[], Mapping[int, float]], number: int, timeout_s: float | None
 ) -> int | None:
-    """Wait for the episodes of some processes.
+    """Wait for some processes, such as for their episodes.
 
     Args:
-        waiting: for the episodes.
+        waiting: for what they do.
         steps: tells how many steps each process has taken, or ``AT_REST``, of those that answer; what it raises is
             passed on.
         number: of the processes.
         timeout_s: seconds in which a process must first answer, and then take a step; None: it has all the time.
 
     Returns:
-        The process that has taken no step for so long; None if the episodes, or an error, are there.
+        The process that has taken no step for so long; None if the result, or an error, is there.
     """
     asked_s = time.monotonic()
     taken: dict[int, float] = {}
