@@ -4,11 +4,13 @@ import copy
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
 
-from rcdsac_trl.deploy import Guard, Policy
+from rcdsac_trl.deploy import Guard, Policy, Stamps
+from rcdsac_trl.deploy.navigation.cost_to_go import _descend, _sweep
 from rcdsac_trl.deploy.navigation.detour import BESIDE_M, is_clear, plan_detour
 from rcdsac_trl.deploy.navigation.local_map import LocalMap, LocalMapSettings
 from rcdsac_trl.deploy.navigation.navigator import Navigator, NavigatorSettings
@@ -53,6 +55,18 @@ def test_a_detour_leads_past_the_nearer_end_of_a_wall_and_keeps_clear() -> None:
     points = local_map.remembered
     for start, end in zip([(0.0, 0.0), *corners], corners, strict=False):
         assert np.hypot(*(points[:, None] - np.linspace(start, end, 50)).T).min() > 0.19
+
+
+def test_no_detour_waits_for_the_compiler() -> None:
+    planned = Mock(wraps=plan_detour)
+    with patch("rcdsac_trl.deploy.navigation.navigator.plan_detour", planned):
+        navigator = Navigator(AT_ONCE)
+        assert planned.call_count == 1
+        advice = navigator.advise(seen((0.0, 0.0, 0.0)), ALL, GOAL, STANDING, 0.0)
+    assert planned.call_count == 2
+    assert advice.waypoints != GOAL
+    # What was compiled when it was made is what plans: of other types it would be compiled again.
+    assert len(_sweep.signatures) == len(_descend.signatures) == 1
 
 
 def test_where_nothing_leads_on_there_is_no_detour() -> None:
@@ -151,6 +165,38 @@ def test_what_is_out_of_view_is_told_to_the_stop_zone() -> None:
     assert advice.been[0] == pytest.approx((-x, 0.0), abs=0.1)
 
 
+def test_between_two_scans_what_is_remembered_stays_where_it_is() -> None:
+    navigator = Navigator(replace(AT_ONCE, replan=False))
+    ahead = np.array([[1.0, -0.3, 1.0, 0.3]])
+    for step in range(3):
+        navigator.advise(seen((0.0, 0.0, 0.0), ahead), ALL, GOAL, STANDING, 0.14 if step else 0.0)
+    blind = Sectors(OPEN, np.zeros(180, np.bool_))
+    assert navigator.known(blind, None, 1.5).distances_m[0] == pytest.approx(1.0, abs=0.01)
+    on, turned = (navigator.known(blind, None, 1.5, np.array(moved)) for moved in ((0.2, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    assert on.distances_m[0] == pytest.approx(0.8, abs=0.01)
+    assert np.isinf(turned.distances_m[0])
+    assert turned.distances_m[180 - 29] == pytest.approx(1.0, abs=0.02)  # at -1 rad
+
+
+def test_a_call_with_the_same_scan_is_guarded_from_where_the_robot_has_got_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[float, float]] = []
+
+    def limit(
+        _: Guard, v: float, omega: float, sectors: Sectors, measured: Any, been: np.ndarray, *__: Any
+    ) -> tuple[float, float, None]:
+        told.append((float(sectors.distances_m[0]), float(been[0, 0])))
+        return v, omega, None
+
+    monkeypatch.setattr(Guard, "limit", limit)
+    driver = policy()
+    wall = np.where(NARROW, seen((0.0, 0.0, 0.0), np.array([[1.0, -0.3, 1.0, 0.3]])), np.inf)
+    blind = Sectors(wall, NARROW & (np.arange(180) > 0))  # what the first sector saw, is remembered
+    driver.act(Sectors(wall, NARROW), AHEAD, (0.5, 0.0), -1.0, stamps=Stamps(10.0, 10.0, 10.0, 10.0))
+    driver.act(blind, AHEAD, (0.5, 0.0), -1.0, stamps=Stamps(10.1, 10.0, 10.1, 10.1))
+    assert told[0] == pytest.approx((1.0, 0.0), abs=0.01)
+    assert told[1] == pytest.approx((0.95, -0.05), abs=0.01)
+
+
 def test_who_has_just_walked_out_of_view_is_told_to_the_stop_zone_where_it_is_by_now() -> None:
     navigator = Navigator(replace(AT_ONCE, replan=False))
     for step in range(25):  # it crosses at 0.5 m/s, and is seen whole for 13 steps
@@ -213,6 +259,17 @@ def test_what_does_not_move_back_is_let_go_after_a_second() -> None:
     ways = [dog.way_out((0.0, 0.0), STRAIGHT, 0.125) for _ in range(12)]
     assert [way is None for way in ways] == [False] * 8 + [True] * 4
     assert dog.idle_s == 0.0
+
+
+def test_where_it_has_been_is_forgotten_like_what_it_has_seen() -> None:
+    navigator = Navigator(NavigatorSettings(replan=False, memory_s=30.0, watchdog=None))
+    for step in range(21):
+        navigator.advise(OPEN, NARROW, GOAL, (0.5, 0.0), 0.1 if step else 0.0)
+    navigator.advise(OPEN, NARROW, GOAL, STANDING, 0.0)
+    assert navigator.advise(OPEN, NARROW, GOAL, STANDING, 27.5).been[:, 0].min() == pytest.approx(-1.0, abs=0.06)
+    assert navigator.advise(OPEN, NARROW, GOAL, STANDING, 1.6).been[:, 0].min() > -0.6  # half of its 2 s ago
+    left = navigator.advise(OPEN, NARROW, GOAL, STANDING, 30.0).been
+    np.testing.assert_allclose(left, [[0.0, 0.0]])  # whoever stepped there since is not seen
 
 
 def test_beta_is_what_was_asked_for_as_soon_as_the_robot_gets_on() -> None:

@@ -3,6 +3,7 @@
 import math
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from rcdsac_trl.deploy import CameraPose, InputLimits, Policy
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.driver import Driver
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.action import clip_command
 from robots import agent
 
 PERIOD_S = 0.14
@@ -29,10 +31,12 @@ def path(points: Any, frame: str = "odom") -> SimpleNamespace:
     return SimpleNamespace(header=header(0.0, frame), poses=poses)
 
 
-def odometry(now_s: float, x: float, y: float, yaw: float = 0.0, frame: str = "odom") -> SimpleNamespace:
+def odometry(
+    now_s: float, x: float, y: float, yaw: float = 0.0, frame: str = "odom", v: float = 0.1
+) -> SimpleNamespace:
     turn = SimpleNamespace(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
     pose = SimpleNamespace(position=SimpleNamespace(x=x, y=y), orientation=turn)
-    twist = SimpleNamespace(linear=SimpleNamespace(x=0.1), angular=SimpleNamespace(z=0.0))
+    twist = SimpleNamespace(linear=SimpleNamespace(x=v), angular=SimpleNamespace(z=0.0))
     return SimpleNamespace(
         header=header(now_s, frame), pose=SimpleNamespace(pose=pose), twist=SimpleNamespace(twist=twist)
     )
@@ -260,3 +264,46 @@ def test_odometry_in_millimetres_is_told_when_the_robot_moves() -> None:
         reasons.append(str(driver.command(now).reason))
     assert reasons[0] == "None"
     assert all("the pose moved by 42 m in 0.14 s, more than 10.3 m: give metres" in reason for reason in reasons[1:])
+
+
+def test_odometry_without_velocities_is_told_when_the_robot_moves() -> None:
+    driver = Driver(Policy(agent()))
+    driver.on_path(path([(0.0, 0.0), (5.0, 0.0)]))
+    reasons = []
+    # It stands for a while, and drifts; then it moves.
+    for step, x in enumerate([0.0, 0.01, 0.0, *np.arange(0.04, 0.25, 0.04)]):
+        now = 10.0 + PERIOD_S * step
+        driver.on_odometry(odometry(now, float(x), 0.0, v=0.0))
+        driver.on_scan(laser(now))
+        reasons.append(str(driver.command(now).reason))
+    told = "the pose moved by 0.16 m in 0.84 s, and the odometry's twist is 0"
+    assert [told in reason for reason in reasons] == [False] * 6 + [True, False, False]
+    assert "the pose moved by 0.24 m" in reasons[-1]
+
+
+@pytest.mark.parametrize("lost", ["scan", "odometry", "both"])
+def test_what_ceases_near_a_wall_lets_nobody_drive_into_it(lost: str) -> None:
+    """Whatever is driven on is a little old, and old before it is refused: the stop zone reckons with both."""
+    wall_m, radius_m = 2.0, 0.25
+    bearings = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    nearest_m = math.inf
+    for gap_m in np.arange(0.26, 0.6, 0.02):  # by then it is lost
+        driver = Driver(Policy(agent()))
+        driver.on_path(path([(0.0, 0.0), (5.0, 0.0)]))
+        x = v = wish = 0.0
+        for step in range(800):
+            now = 100.0 + 0.01 * step
+            gone = wall_m - radius_m - x < gap_m
+            if not gone or lost == "scan":
+                driver.on_odometry(odometry(now, x, 0.0, v=v))
+            if (not gone or lost == "odometry") and step % 10 == 0:
+                with np.errstate(divide="ignore"):
+                    seen_m = np.where(np.cos(bearings) > 1e-6, (wall_m - x) / np.cos(bearings), math.inf)
+                driver.on_scan(laser(now, np.where(seen_m > 10.0, math.inf, seen_m)))
+            if step % 14 == 0:
+                with patch.object(Policy, "_wish", return_value=((0.6, 0.0), [])):
+                    wish = driver.command(now).v_m_per_s
+            v, _ = clip_command(wish, 0.0, v, 0.0, 0.01)
+            x += 0.01 * v
+        nearest_m = min(nearest_m, wall_m - radius_m - x)
+    assert nearest_m >= 0.05

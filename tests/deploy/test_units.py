@@ -257,10 +257,10 @@ def test_a_command_is_stamped_in_seconds() -> None:
 def test_a_pose_in_millimetres_moves_too_fast_and_a_corrected_one_does_not() -> None:
     watch = PoseWatch()
     for position, stamp in (((0.0, 0.0), 1.0), ((0.1, 0.0), 1.14), ((5.0, 3.0), 1.28), ((5.1, 3.0), 1.42)):
-        watch.check(position, stamp)
+        watch.check(position, stamp, (0.6, 0.0))
     with pytest.raises(BadInputError, match=r"moved by 84 m in 0\.14 s, more than 10\.3 m: give metres"):
-        watch.check((89.1, 3.0), 1.56)
-    watch.check((89.2, 3.0), 1.70)
+        watch.check((89.1, 3.0), 1.56, (0.6, 0.0))
+    watch.check((89.2, 3.0), 1.70, (0.6, 0.0))
 
 
 def test_stamps_of_any_clock_in_seconds_drive() -> None:

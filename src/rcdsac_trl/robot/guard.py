@@ -136,6 +136,15 @@ class Guard:
         }
         return cls(**{**limits, **changes, "robot": robot})
 
+    def later(self, late_s: float) -> "Guard":
+        """Return this guard for input that is so much older: the robot has driven on since, and still does.
+
+        Example:
+            >>> round(Guard().later(0.3).reaction_s, 2)
+            0.55
+        """
+        return replace(self, reaction_s=min(self.reaction_s + late_s, _LARGEST["reaction_s"])) if late_s else self
+
     def limit(
         self,
         v: float,

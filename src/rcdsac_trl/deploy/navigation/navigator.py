@@ -29,6 +29,8 @@ from rcdsac_trl.robot.sectors import Sectors, check_switches
 _TRAIL_STEP_M, _TRAIL_PLACES = 0.02, 75
 # A detour is planned anew after so long, s; its corner gives way to the next within this, m.
 _REPLAN_S, _CORNER_M = 0.4, 0.3
+_NOT_MOVED = np.zeros(3)
+_NOT_MOVED.flags.writeable = False
 # Two waypoints nearer to each other are one, the goal.
 _SAME_M = 1e-3
 # What walks is told by so many points around its middle, 4 cm apart.
@@ -130,6 +132,9 @@ class Navigator:
         self.static_layer = static_layer
         self.robot = robot
         self.reset()
+        # Now, not before the first thing in the way: where nothing is kept of it yet, compiling takes seconds, and a
+        # base may drive on meanwhile.
+        plan_detour(self._map.clearances, (0.0, 0.0), (1.0, 0.0), robot.circumradius_m)
 
     def reset(self) -> None:
         """Forget everything: the robot was put somewhere else, or has a new task."""
@@ -137,7 +142,9 @@ class Navigator:
         max_range_m = self.robot.lidar.max_range_m
         self._map = LocalMap(LocalMapSettings(memory_s=self.settings.memory_s), nothing, max_range_m)
         self._tracks = MoverTracks(TrackSettings(), nothing, max_range_m)
-        self._trail: deque[Place] = deque(maxlen=_TRAIL_PLACES)
+        # Where the robot was, and when, s.
+        self._trail: deque[tuple[float, float, float]] = deque(maxlen=_TRAIL_PLACES)
+        self._time_s = 0.0
         self._far: Clearances | None = None
         self._far_s = 0.0
         self._blocked_s = self._planned_s = 0.0
@@ -169,7 +176,7 @@ class Navigator:
         self._look_far(elapsed_s, pose)
         next_two = self._waypoints(waypoints, elapsed_s) if self.settings.replan else waypoints
         boldness, instead = 0.0, None
-        been = seen_from(np.array(self._trail), self._map.pose)
+        been = seen_from(np.array(self._trail).reshape(-1, 3)[:, :2], self._map.pose)
         if self._watchdog is not None:
             self._watchdog.observe(self._map.place, elapsed_s)
             boldness = self._watchdog.boldness
@@ -192,12 +199,17 @@ class Navigator:
         self._tracks.observe(seen_m, self._map.pose, elapsed_s, covered)
         standing = self._on_map_within(0.5 * self._map.settings.size_m, pose)
         self._map.observe(seen_m, self._tracks.moving, placed(standing, self._map.pose))
+        self._leave_trail(velocity[0], elapsed_s)
+
+    def _leave_trail(self, v: float, elapsed_s: float) -> None:
+        """Remember where the robot has driven ahead, and that for no longer than what was seen."""
+        self._time_s += elapsed_s
+        while self._trail and self._trail[0][2] < self._time_s - self.settings.memory_s:
+            self._trail.popleft()
         # Only ahead: who backs a little beyond what it knows must not take that as known.
-        ahead = (
-            velocity[0] > 0.0 and math.dist(self._trail[-1], self._map.place) > _TRAIL_STEP_M if self._trail else True
-        )
-        if ahead:
-            self._trail.append(self._map.place)
+        here = self._map.place
+        if not self._trail or (v > 0.0 and math.dist(self._trail[-1][:2], here) > _TRAIL_STEP_M):
+            self._trail.append((*here, self._time_s))
 
     def _waypoints(self, waypoints: tuple[Place, Place], elapsed_s: float) -> tuple[Place, Place]:
         """Return the next two waypoints, of a detour where the way to the first is blocked."""
@@ -251,7 +263,9 @@ class Navigator:
             return np.empty((0, 2))
         return self.static_layer.around(pose, reach_m)
 
-    def known(self, sectors: Sectors, pose: Pose | None, reach_m: float) -> Sectors:
+    def known(
+        self, sectors: Sectors, pose: Pose | None, reach_m: float, moved: NDArray[np.float64] = _NOT_MOVED
+    ) -> Sectors:
         """Return what a stop zone minds: what is seen, remembered where nothing is, or on the map.
 
         What walks is expected where its velocity has led it since it left the view.
@@ -260,9 +274,10 @@ class Navigator:
             sectors: what the range sensor says.
             pose: as in :meth:`advise`.
             reach_m: how far the stop zone looks; what the map shows farther away is left out.
+            moved: since :meth:`advise`, x and y in m and yaw in rad, float64 [3].
         """
         remembered = np.concatenate([self._map.remembered, self._edges_of_movers()])
-        unseen_m = self._nearest_m(seen_from(remembered, self._map.pose))
+        unseen_m = self._nearest_m(seen_from(seen_from(remembered, self._map.pose), moved))
         known_m = np.where(sectors.covered, sectors.distances_m, unseen_m)
         # On the map is what no sensor sees, too.
         known_m = np.minimum(known_m, self._nearest_m(self._on_map_within(reach_m, pose)))

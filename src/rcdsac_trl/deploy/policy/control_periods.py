@@ -16,6 +16,7 @@ class ControlPeriods:
     Attributes:
         last: stamps of the last good input; None where it had none.
         time_s: of this call, s: when its odometry was measured, or counted in the middle of training's periods.
+        age_s: of the older of ranges and odometry in this call, s; 0 without stamps.
 
     Example:
         >>> periods = ControlPeriods((0.12, 0.16))
@@ -34,7 +35,7 @@ class ControlPeriods:
         self.last: Stamps | None = None
         self._last_asked: Stamps | None = None
         self._refused = 0
-        self.time_s = 0.0
+        self.time_s = self.age_s = 0.0
 
     def memory_is_old(self, stamps: Stamps | None) -> bool:
         """Return whether the agent was asked so long ago that its memory is of another situation."""
@@ -56,11 +57,18 @@ class ControlPeriods:
             return (1 + self._refused) * self._middle_s
         return stamps.scan_s - self._last_asked.scan_s
 
+    def since_asked_s(self, stamps: Stamps | None) -> float:
+        """Return how much later than in the call that asked the agent the odometry was measured, s."""
+        if stamps is None or self._last_asked is None:
+            return 0.0
+        return stamps.velocity_s - self._last_asked.velocity_s
+
     def accept(self, stamps: Stamps | None, asked: bool) -> None:
         """Take down a call with good input, and whether the agent was asked in it."""
         self._refused = 0
         self.last = stamps
         self.time_s = self.time_s + self._middle_s if stamps is None else stamps.velocity_s
+        self.age_s = 0.0 if stamps is None else max(0.0, stamps.now_s - min(stamps.scan_s, stamps.velocity_s))
         if asked:
             self._last_asked = stamps
 

@@ -249,7 +249,7 @@ class Driver:
         """Return the robot's pose in the path's frame, the stamp of that pose, and the stamp of the odometry."""
         pose, moved_s = messages.pose_of_odometry(self._odometry), messages.stamp_s(self._odometry)
         # Only odometry: what a localisation corrects is no motion.
-        self._poses.check(pose[:2], moved_s)
+        self._poses.check(pose[:2], moved_s, messages.velocity_of_odometry(self._odometry))
         base_frame = str(getattr(self._odometry, "child_frame_id", ""))
         self._frames.moved(str(self._odometry.header.frame_id), base_frame, moved_s, pose)
         here, pose_s = self._frames.robot_in(self._path_frame, now_s)

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,33 @@ from rcdsac_trl.deploy.policy.robot_observer import RobotObserver
 from rcdsac_trl.deploy.policy.weights import Weights
 from rcdsac_trl.deploy.sensors.arrays import described, numbers_of
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.dead_reckoning import DeadReckoning
 from rcdsac_trl.robot.guard import Guard
 from rcdsac_trl.robot.latency import Ahead
+from rcdsac_trl.robot.planar import seen_from
 from rcdsac_trl.robot.sectors import Sectors
 
 if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.navigator import Advice, Navigator
     from rcdsac_trl.deploy.navigation.static_layer import Pose
+
+
+class _Place(NamedTuple):
+    """What the guard limits a command by.
+
+    Attributes:
+        sectors: what the range sensor says.
+        measured: velocities, m/s and rad/s.
+        ahead: where the robot will be when the command begins to act.
+        on_map: where it is on its navigator's map; None where that has none.
+        moved: how it has moved since the agent and the navigator were asked, x and y in m and yaw in rad, float64 [3].
+    """
+
+    sectors: Sectors
+    measured: tuple[float, float]
+    ahead: Ahead
+    on_map: "Pose | None"
+    moved: NDArray[np.float64]
 
 
 class Policy:
@@ -390,7 +410,16 @@ class Policy:
                 self._turned_to = context if context != asked else None
             seen = self._observer.observe(sectors, next_two, measured, elapsed_s, ahead)
             self._see(*seen, context)
-        return self._command(sectors, measured, ahead, fresh, fresh and forgot, on_map)
+            self._asked_at = measured
+        moved = self._moved(measured, self._periods.since_asked_s(stamps))
+        return self._command(_Place(sectors, measured, ahead, on_map, moved), fresh, fresh and forgot)
+
+    def _moved(self, measured: tuple[float, float], elapsed_s: float) -> NDArray[np.float64]:
+        """Return how the robot has moved since the agent was asked, by the velocities then and now."""
+        way = DeadReckoning()
+        way.move(*self._asked_at, 0.0)
+        way.move(*measured, elapsed_s)
+        return way.pose
 
     def _see(
         self, bins: NDArray[np.float32], vectors: Sequence[float] | NDArray[np.float32], context: float | None
@@ -399,19 +428,11 @@ class Policy:
         self._told = self._networks.see(bins, vectors, context)
         return self._told
 
-    def _command(
-        self,
-        sectors: Sectors,
-        measured: tuple[float, float],
-        ahead: Ahead,
-        fresh: bool,
-        forgot: bool,
-        on_map: "Pose | None",
-    ) -> Command:
+    def _command(self, place: _Place, fresh: bool, forgot: bool) -> Command:
         outlook = self._told
         assert outlook is not None
         wish, reasons = self._wish(outlook)
-        driven, limit = self._limited(wish, sectors, measured, ahead, on_map)
+        driven, limit = self._limited(wish, place)
         if limit is not None:
             reasons.insert(0, f"limited by {limit}; it ends when the cause does")
         # Networks are told what the robot was told: the limits are part of the world.
@@ -427,31 +448,26 @@ class Policy:
             return outlook.wanted, ["it stands still, so beta turns to its boldest until it gets on"]
         return outlook.wanted, []
 
-    def _limited(
-        self,
-        wish: tuple[float, float],
-        sectors: Sectors,
-        measured: tuple[float, float],
-        ahead: Ahead,
-        on_map: "Pose | None",
-    ) -> tuple[tuple[float, float], str | None]:
+    def _limited(self, wish: tuple[float, float], place: _Place) -> tuple[tuple[float, float], str | None]:
         """Return the velocities that the guard allows, and what limits them; None where nothing does."""
         if self.guard is None:
             return wish, None
-        been = None if self._advice is None else self._advice.been
-        reach_m = self.guard.reach_m(abs(wish[0]), ahead)
-        v, omega, limit = self.guard.limit(*wish, self._known(sectors, on_map, reach_m), measured, been, ahead)
-        if on_map is not None and limit:
-            unmapped = self._known(sectors, None, reach_m)
-            if not self.guard.limit(*wish, unmapped, measured, been, ahead)[2]:
+        # A latency is counted from the measurement: what is allowed for there is late no more.
+        guard = self.guard.later(max(0.0, self._periods.age_s - self._latency_s))
+        been = None if self._advice is None else seen_from(self._advice.been, place.moved)
+        reach_m = guard.reach_m(abs(wish[0]), place.ahead)
+        v, omega, limit = guard.limit(*wish, self._known(place, reach_m), place.measured, been, place.ahead)
+        if place.on_map is not None and limit:
+            unmapped = self._known(place._replace(on_map=None), reach_m)
+            if not guard.limit(*wish, unmapped, place.measured, been, place.ahead)[2]:
                 limit += " around what the map shows"
         return (v, omega), limit
 
-    def _known(self, sectors: Sectors, on_map: "Pose | None", reach_m: float) -> Sectors:
+    def _known(self, place: _Place, reach_m: float) -> Sectors:
         """Return what the stop zone minds: what is sensed, and what the navigator knows besides."""
         if self.navigator is None:
-            return sectors
-        return self.navigator.known(sectors, on_map, reach_m)
+            return place.sectors
+        return self.navigator.known(place.sectors, place.on_map, reach_m, place.moved)
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""
@@ -470,5 +486,6 @@ class Policy:
         self._networks.forget()
         self._observer.forget()
         self._advice, self._turned_to = None, None
+        self._asked_at = (0.0, 0.0)
         if self.navigator is not None:
             self.navigator.reset()
