@@ -1,5 +1,6 @@
 """Live over DDS in ROS 2's names and bytes: the types, the bridge on a clock of its own, and two processes."""
 
+import io
 import math
 import os
 import re
@@ -8,7 +9,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -463,16 +464,18 @@ def test_zeros_are_open_space_where_the_command_line_says_so(folder: Path) -> No
 class Told:
     """Stands in for a bridge whose reader comes after 3 s, and ends the program after 50 steps."""
 
-    def __init__(self) -> None:
+    def __init__(self, end: Callable[[], None] = lambda: signal.raise_signal(signal.SIGTERM)) -> None:
         self.topics = {"scan": "scan"}
         self.simulated = False
         self.driver = Driver(Policy(agent(period_s=(0.0, 0.0))))
         self.steps = 0
+        self._end = end
 
     def step(self, now_s: float) -> Any:
+        assert self.steps < 50, "it was to end"
         self.steps += 1
         if self.steps == 50:
-            signal.raise_signal(signal.SIGTERM)
+            self._end()
         return self.driver.policy.refuse("there is no scan yet")
 
     def report(self) -> str:
@@ -482,14 +485,62 @@ class Told:
         self.steps = -1
 
 
-def test_the_program_tells_who_reads_it_whenever_that_changes(capsys: pytest.CaptureFixture[str]) -> None:
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    bridge: Any = Told()
-    try:
+@pytest.fixture
+def signals() -> Iterator[None]:
+    """Give the test's own handlers back; a closed terminal ends no test."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGHUP, lambda number, frame: None)
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_whatever_asks_it_to_end_the_last_command_is_sent(number: signal.Signals, signals: None) -> None:
+    bridge: Any = Told(lambda: signal.raise_signal(number))
+    dds_node.drive(bridge)
+    assert bridge.steps == -1
+
+
+def test_a_terminal_that_it_is_to_outlive_ends_nothing(signals: None) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    dds_node.drive(Told())  # type: ignore[arg-type]
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
+def test_an_error_surfaces_after_the_last_command(signals: None) -> None:
+    def end() -> None:
+        raise RuntimeError("the network is gone")
+
+    bridge: Any = Told(end)
+    with pytest.raises(RuntimeError, match="the network is gone"):
         dds_node.drive(bridge)
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    assert bridge.steps == -1
+
+
+def test_it_drives_on_when_nobody_reads_what_it_tells(monkeypatch: pytest.MonkeyPatch, signals: None) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended: list[int] = []
+
+    def end() -> None:
+        ended.append(bridge.steps)
+        signal.raise_signal(signal.SIGTERM)
+
+    bridge: Any = Told(end)
+    with open(writer, "wb", buffering=0) as raw, io.TextIOWrapper(raw, write_through=True) as nobody_reads:
+        monkeypatch.setattr(sys, "stderr", nobody_reads)
+        with pytest.raises(BrokenPipeError):
+            print("as it is", file=sys.stderr, flush=True)
+        dds_node.drive(bridge)
+    assert (ended, bridge.steps) == ([50], -1)
+
+
+def test_the_program_tells_who_reads_it_whenever_that_changes(
+    capsys: pytest.CaptureFixture[str], signals: None
+) -> None:
+    bridge: Any = Told()
+    dds_node.drive(bridge)
     assert bridge.steps == -1
     assert capsys.readouterr().err.splitlines() == [
         "topics: /scan; Ctrl-C ends it",

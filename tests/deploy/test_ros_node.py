@@ -26,6 +26,7 @@ class Node:
 
     given: dict[str, Any]
     nodes: ClassVar[list["Node"]]
+    handlers: ClassVar[dict[int, Any]]
     endpoints: dict[str, list[str]]
 
     def __init__(self, name: str) -> None:
@@ -96,7 +97,9 @@ def ros_node(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
     for name, content in packed(agent()).items():
         (tmp_path / name).write_bytes(content)
     Node.given, Node.endpoints, Node.nodes = {"agent": str(tmp_path)}, {}, []
-    monkeypatch.setattr(signal, "signal", lambda number, handler: None)  # the test's own stay
+    Node.handlers = {}
+    monkeypatch.setattr(signal, "signal", Node.handlers.__setitem__)  # the test's own stay
+    monkeypatch.setattr(signal, "getsignal", lambda number: signal.SIG_DFL)
     contents: dict[str, dict[str, Any]] = {
         "rclpy": {
             "init": lambda signal_handler_options: None,
@@ -296,7 +299,7 @@ def test_the_last_command_is_to_stand(ros_node: Any, monkeypatch: pytest.MonkeyP
 
     def spin(node: Any) -> None:
         assert driven(node).twist.linear.x != 0.0 if kind == "TwistStamped" else driven(node).linear.x != 0.0
-        raise KeyboardInterrupt  # Ctrl-C, and SIGTERM
+        Node.handlers[signal.SIGINT](signal.SIGINT, None)
 
     monkeypatch.setattr(ros_node.rclpy, "spin", spin)
     ros_node.main()
@@ -304,6 +307,33 @@ def test_the_last_command_is_to_stand(ros_node: Any, monkeypatch: pytest.MonkeyP
     last = node.published[-1].twist if kind == "TwistStamped" else node.published[-1]
     assert (last.linear.x, last.angular.z) == (0.0, 0.0)
     assert node.waited == [1.0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_what_asks_it_to_end_is_heard_once(ros_node: Any, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    monkeypatch.setattr(ros_node.rclpy, "spin", lambda node: Node.handlers[number](number, None))
+    ros_node.main()
+    assert Node.nodes[0].waited == [1.0]
+    asking = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    assert Node.handlers == dict.fromkeys(asking, signal.SIG_IGN)  # a second one ends no last command
+
+
+def test_an_error_surfaces_after_the_last_command(ros_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def spin(node: Any) -> None:
+        assert driven(node).twist.linear.x != 0.0
+        raise RuntimeError("the wait set is gone")
+
+    monkeypatch.setattr(ros_node.rclpy, "spin", spin)
+    monkeypatch.setattr(Node, "destroy_node", lambda node: done.append("destroyed"))
+    monkeypatch.setattr(ros_node.rclpy, "try_shutdown", lambda: done.append("left"))
+    with pytest.raises(RuntimeError, match="the wait set is gone"):
+        ros_node.main()
+    (node,) = Node.nodes
+    assert (node.published[-1].twist.linear.x, node.published[-1].twist.angular.z) == (0.0, 0.0)
+    assert node.waited == [1.0]
+    assert done == ["destroyed", "left"]
 
 
 def test_without_ros_it_says_what_to_source(tmp_path: Path) -> None:

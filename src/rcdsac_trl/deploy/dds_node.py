@@ -8,6 +8,7 @@ return's quantiles on ``return_quantiles``, and on ``drive_status`` why the robo
 """
 
 import argparse
+import contextlib
 import importlib.util
 import os
 import signal
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, get_args
 import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings, Localisation
 from rcdsac_trl.deploy.policy.driver import Driver
+from rcdsac_trl.deploy.ros.endings import ending_signals
 from rcdsac_trl.deploy.ros.topics import without_numbers
 from rcdsac_trl.deploy.sensors.scan import Meaning
 from rcdsac_trl.errors import UserInputError
@@ -36,7 +38,7 @@ _LARGEST_DOMAIN = 232  # the ports of larger ones are beyond the last
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Drive until Ctrl-C or SIGTERM, and leave the robot standing.
+    """Drive until Ctrl-C, SIGTERM or SIGHUP, and leave the robot standing.
 
     Args:
         arguments: of the command line; None: those of this process.
@@ -81,7 +83,8 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
 def drive(bridge: "DdsBridge") -> None:
     """Step once in every control period, and tell on the standard error stream why the robot does not go as it would.
 
-    Who reads the commands, and which topics nobody writes, is told as well, whenever it changes.
+    Who reads the commands, and which topics nobody writes, is told as well, whenever it changes. Whatever ends it, an
+    error too, the last command is to stand.
 
     Args:
         bridge: that drives; its clock is that of this computer, or the simulated one.
@@ -92,29 +95,31 @@ def drive(bridge: "DdsBridge") -> None:
         nonlocal leaving
         leaving = True
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ending_signals():
         signal.signal(number, leave)
     _tell(f"topics: {', '.join(f'/{topic}' for topic in bridge.topics.values())}; Ctrl-C ends it")
     period_s = sum(bridge.driver.policy.config.period_s) / 2.0
     said: str | None = None
     reported, steps = "", 0
     now_s = 0.0
-    for at_s in _simulated_ticks(bridge, period_s) if bridge.simulated else _ticks(period_s):
-        if leaving:
-            break
-        steps += 1
-        if steps % _REPORT_EVERY == 0 and (report := bridge.report()) != reported:
-            _tell(report)
-            reported = report
-        if at_s is None:
-            continue
-        now_s = at_s
-        command = bridge.step(now_s)
-        kind = without_numbers(command.reason)
-        if kind not in (said, None):
-            _tell(str(command.reason))
-        said = kind
-    bridge.leave(now_s if bridge.simulated else time.time())
+    try:
+        for at_s in _simulated_ticks(bridge, period_s) if bridge.simulated else _ticks(period_s):
+            if leaving:
+                break
+            steps += 1
+            if steps % _REPORT_EVERY == 0 and (report := bridge.report()) != reported:
+                _tell(report)
+                reported = report
+            if at_s is None:
+                continue
+            now_s = at_s
+            command = bridge.step(now_s)
+            kind = without_numbers(command.reason)
+            if kind not in (said, None):
+                _tell(str(command.reason))
+            said = kind
+    finally:
+        bridge.leave(now_s if bridge.simulated else time.time())
 
 
 def _ticks(period_s: float) -> Iterator[float]:
@@ -243,7 +248,9 @@ def _domain_id(text: str) -> int:
 
 
 def _tell(sentence: str) -> None:
-    print(sentence, file=sys.stderr, flush=True)
+    """Say a sentence to whoever reads it: nobody where a pipe or a terminal is gone, which is no reason to stop."""
+    with contextlib.suppress(OSError):
+        print(sentence, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import math
 import signal
 import sys
 from functools import partial
+from types import FrameType
 from typing import Any
 
 from rcdsac_trl.errors import UserInputError
@@ -46,6 +47,7 @@ import rcdsac_trl
 from rcdsac_trl.deploy.frames.robot_frames import FrameSettings
 from rcdsac_trl.deploy.policy.command import Command
 from rcdsac_trl.deploy.policy.driver import Driver
+from rcdsac_trl.deploy.ros.endings import ending_signals
 from rcdsac_trl.deploy.ros.messages import twist, twist_stamped
 from rcdsac_trl.deploy.ros.topics import DRIVING, no_map_on, readers_of, without_numbers, writers_of
 from rcdsac_trl.errors import UserInputError
@@ -204,24 +206,31 @@ def _made(name: str) -> Any:
     return getattr(importlib.import_module(package.replace("/", ".")), kind)()
 
 
+def _end(signal_number: int, frame: FrameType | None) -> None:
+    """End the spinning, once: a second signal, which launch files send, would end the sending of the last command."""
+    for number in ending_signals():
+        signal.signal(number, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
 def main() -> None:
-    """Spin until Ctrl-C or SIGTERM, and leave the robot standing."""
+    """Spin until Ctrl-C, SIGTERM, SIGHUP or an error, and leave the robot standing."""
     # Handlers of its own would shut ROS down at once, and no last command could be sent.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in ending_signals():
+        signal.signal(number, _end)
     try:
         node = PolicyNode()
     except UserInputError as error:
         rclpy.try_shutdown()
         print(error, file=sys.stderr)
         raise SystemExit(2) from None
-    try:
+    with contextlib.ExitStack() as ending:
+        ending.callback(rclpy.try_shutdown)
+        ending.callback(node.destroy_node)
+        ending.callback(node.leave)
         with contextlib.suppress(KeyboardInterrupt):
             rclpy.spin(node)
-        node.leave()
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 if __name__ == "__main__":
