@@ -175,6 +175,26 @@ def test_parameters_are_live_and_zeros_mean_what_is_said(ros_node: Any) -> None:
     assert node.told == []
 
 
+def test_a_beta_that_the_agent_does_not_know_is_refused_and_changes_nothing(ros_node: Any) -> None:
+    node = ros_node.PolicyNode()
+    node.set([SimpleNamespace(name="beta", value=-2.0)])
+    refused = node.set([SimpleNamespace(name="stop", value=True), SimpleNamespace(name="beta", value=5.0)])
+    assert not refused.successful
+    assert refused.reason == "beta=5 is outside [-2, 0], where this agent was trained"
+    assert node.driver.beta == -2.0
+    assert driven(node).twist.linear.x != 0.0
+    assert node.set([SimpleNamespace(name="beta", value=-1.0)]).successful
+
+
+def test_one_that_starts_stopped_stands_until_it_is_released(ros_node: Any) -> None:
+    Node.given["stop"] = True
+    node = ros_node.PolicyNode()
+    assert driven(node).twist.linear.x == 0.0
+    assert "stop() was called" in node.told[-1]
+    node.set([SimpleNamespace(name="stop", value=False)])
+    assert driven(node).twist.linear.x != 0.0
+
+
 def test_it_reads_transforms_and_says_where_the_sensors_are_that_have_none(ros_node: Any) -> None:
     node = ros_node.PolicyNode()
     assert node.qos["/tf_static"].durability == "kept"
@@ -270,6 +290,7 @@ def test_it_tells_who_reads_its_commands_whenever_that_changes(ros_node: Any) ->
             {"camera_frames": ["a", "b"], "camera_topics": ["a"]},
             "camera_frames has 2 entries, camera_topics 1, camera_views_rad 1: give one a camera in each",
         ),
+        ({"beta": 5.0}, "beta=5 is outside [-2, 0], where this agent was trained"),
         ({"localisation": "gps"}, "localisation='gps' is neither 'tf' nor 'pose'"),
         ({"agent": "nobody"}, "there is no agent 'nobody'"),
     ],

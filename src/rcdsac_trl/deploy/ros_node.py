@@ -100,7 +100,9 @@ class PolicyNode(Node):
         self.declare_parameter("beta", math.nan)
         self.declare_parameter("stop", False)
         self.add_on_set_parameters_callback(self._set)
-        self._set([self.get_parameter("beta"), self.get_parameter("stop")])
+        begins = self._set([self.get_parameter("beta"), self.get_parameter("stop")])
+        if not begins.successful:
+            raise UserInputError(begins.reason)
         self._subscribe([topic for _, topic, _ in cameras])
         self._commands = self.create_publisher(_COMMAND_TYPES[self._command_type], "cmd_vel", 1)
         self._quantiles = self.create_publisher(Float32MultiArray, "return_quantiles", 1)
@@ -150,11 +152,17 @@ class PolicyNode(Node):
             self.create_subscription(OccupancyGrid, "map", driver.on_map, _KEPT_QOS)
 
     def _set(self, parameters: list[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            if parameter.name == "beta":
-                self.driver.beta = None if math.isnan(parameter.value) else float(parameter.value)
-            elif parameter.name == "stop":
-                (self.driver.policy.stop if parameter.value else self.driver.policy.resume)()
+        """Take live parameters over; none of them where the agent would not drive with this beta."""
+        given = {parameter.name: parameter.value for parameter in parameters}
+        if "beta" in given:
+            beta = None if math.isnan(given["beta"]) else float(given["beta"])
+            try:
+                self.driver.policy.check_beta(beta)
+            except UserInputError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            self.driver.beta = beta
+        if "stop" in given:
+            (self.driver.policy.stop if given["stop"] else self.driver.policy.resume)()
         return SetParametersResult(successful=True)
 
     def leave(self) -> None:
