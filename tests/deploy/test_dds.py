@@ -373,6 +373,7 @@ def folder(tmp_path: Path) -> Path:
         (["--camera", "cam", "points", "wide"], {}, "--camera cam: a view of wide is no number: give radians"),
         (["--camera", "cam", "p q", "1.5"], {}, "cloud:=p q is no topic of ROS"),
         (["--localisation-timeout", "-1"], {}, "localisation_timeout_s=-1.0 must be a positive number of seconds"),
+        (["--plan-timeout", "0"], {}, "plan_timeout_s=0.0 must be a positive number of seconds: leave it out"),
         ([], {"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID=233 is no domain: give a whole number from 0 to 232"),
         ([], {"ROS_DOMAIN_ID": "-1"}, "ROS_DOMAIN_ID=-1 is no domain"),
         # In a domain of its own: what a process knows of one that it is in, it does not read again.
@@ -449,6 +450,16 @@ def test_it_allows_for_a_latency_where_the_command_line_gives_one(folder: Path) 
     asked = dds_node._parser().parse_args([str(folder), "--latency", "0.2"])
     with pytest.raises(UserInputError, match=r"latency_s=0\.2 is allowed for by what an agent remembers"):
         dds_node.bridge_of(asked)
+
+
+def test_a_plan_ages_where_the_command_line_says_so(folder: Path) -> None:
+    for arguments, old in (([], None), (["--plan-timeout", "3"], "the plan is 3.10 s old")):
+        bridge, robot = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), *arguments])), Robot()
+        robot.say(plan=plan(10.0))
+        for now_s, told in ((10.0, None), (13.1, old)):
+            robot.say(scan=laser(now_s), odom=odometry(now_s))
+            reason = bridge.step(now_s).reason
+            assert reason is None if told is None else told in str(reason)
 
 
 def test_zeros_are_open_space_where_the_command_line_says_so(folder: Path) -> None:

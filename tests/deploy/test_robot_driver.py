@@ -1,6 +1,7 @@
 """The driver on a robot: paths that are published again, and what it says of messages that do not come or fit."""
 
 import math
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
@@ -180,6 +181,66 @@ def test_a_path_in_another_frame_is_a_new_one_and_a_broken_one_costs_no_progress
         "the path is in frame 'map', odometry in 'odom': no transform names frame 'map': there are none; start the "
         "localisation, or send both in one frame"
     )
+
+
+# ------------------------------------------------------------------------------------------------ plans that end
+def aging(timeout_s: float | None) -> tuple[Driver, Callable[[float, float], str | None]]:
+    """Make a driver with a plan from (0, 0) to (9, 0) to (9, 9), and what asks it at a time and a place on that."""
+    driver = Driver(Recorder(), plan_timeout_s=timeout_s)  # type: ignore[arg-type]
+    driver.on_path(path([(0.0, 0.0), (9.0, 0.0), (9.0, 9.0)]))
+
+    def reason(now_s: float, x_m: float) -> str | None:
+        driver.on_odometry(odometry(now_s, x_m, 0.0))
+        driver.on_scan(laser(now_s))
+        return driver.command(now_s).reason
+
+    return driver, reason
+
+
+OLD = (
+    "the plan is 3.10 s old, more than plan_timeout_s=3: it was cancelled, or its planner is late; plan again, or give a "
+    "larger plan_timeout_s"
+)
+
+
+def test_a_plan_ages_from_the_first_command_after_it_came_whatever_its_stamp() -> None:
+    driver, reason = aging(3.0)
+    assert [reason(now_s, 0.0) for now_s in (100.0, 103.0, 103.1)] == [None, None, OLD]
+    driver.on_path(path([(0.0, 0.0), (9.0, 0.0), (9.0, 9.0)]))  # stamped 0, as all of them
+    assert [reason(now_s, 0.0) for now_s in (104.0, 107.0, 107.1)] == [None, None, OLD]
+    driver, reason = aging(None)
+    assert [reason(now_s, 0.0) for now_s in (100.0, 1e6)] == [None, None]
+
+
+def test_what_is_refused_for_an_old_plan_costs_no_progress() -> None:
+    """While plans were missing the robot was pushed past the corner: the next plan, the same, is followed from there."""
+    driver, reason = aging(3.0)
+    assert reason(100.0, 0.0) is None
+    assert reason(103.1, 8.8) == OLD
+    assert driver.situation is None
+    driver.on_path(path([(0.0, 0.0), (9.0, 0.0), (9.0, 9.0)]))
+    assert reason(103.2, 8.8) is None
+    assert driver.policy.waypoints == pytest.approx(np.array([(0.2, 9.0), (0.2, 9.0)]))  # type: ignore[attr-defined]
+
+
+def test_a_goal_that_is_reached_stays_so_when_its_plan_is_old() -> None:
+    driver, _ = aging(3.0)
+    driver.on_path(path([(0.0, 0.0), (1.0, 0.0)]))
+    for now_s in (100.0, 110.0):
+        driver.on_odometry(odometry(now_s, 1.0, 0.0))
+        assert driver.command(now_s).reason == "the goal is reached"
+        assert driver.arrived
+
+
+def test_a_plan_is_new_again_where_the_clock_was_set_back() -> None:
+    _, reason = aging(3.0)
+    assert [reason(now_s, 0.0) for now_s in (100.0, 5.0, 8.0, 8.1)] == [None, None, None, OLD]
+
+
+@pytest.mark.parametrize("timeout_s", [0.0, -1.0, math.nan, math.inf])
+def test_a_plan_timeout_that_is_none_is_refused(timeout_s: float) -> None:
+    with pytest.raises(UserInputError, match=f"plan_timeout_s={timeout_s} must be a positive number of seconds"):
+        Driver(Policy(agent()), plan_timeout_s=timeout_s)
 
 
 def test_a_straight_way_of_130_m_is_driven() -> None:

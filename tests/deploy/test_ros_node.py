@@ -239,6 +239,17 @@ def test_it_turns_bold_where_it_stands_if_that_is_asked_for(ros_node: Any) -> No
     assert not any("map" in told for told in node.told)  # detours alone want one
 
 
+def test_plans_age_where_a_timeout_is_given(ros_node: Any) -> None:
+    for given, told in (({}, None), ({"plan_timeout_s": 3.0}, "the plan is 3.10 s old, more than plan_timeout_s=3:")):
+        Node.given |= given
+        node = ros_node.PolicyNode()
+        driven(node)
+        node.subscriptions["scan"](laser(13.1))
+        node.subscriptions["odom"](odometry(13.1, 0.0, 0.0))
+        reason = node.driver.command(13.1).reason
+        assert reason is None if told is None else told in reason
+
+
 def test_it_allows_for_a_latency_where_that_is_given(ros_node: Any) -> None:
     Node.given["latency_s"] = 0.2
     with pytest.raises(UserInputError, match=r"latency_s=0\.2 is allowed for by what an agent remembers"):
@@ -290,6 +301,7 @@ def test_it_tells_who_reads_its_commands_whenever_that_changes(ros_node: Any) ->
             {"camera_frames": ["a", "b"], "camera_topics": ["a"]},
             "camera_frames has 2 entries, camera_topics 1, camera_views_rad 1: give one a camera in each",
         ),
+        ({"plan_timeout_s": 0.0}, "plan_timeout_s=0.0 must be a positive number of seconds"),
         ({"beta": 5.0}, "beta=5 is outside [-2, 0], where this agent was trained"),
         ({"localisation": "gps"}, "localisation='gps' is neither 'tf' nor 'pose'"),
         ({"agent": "nobody"}, "there is no agent 'nobody'"),

@@ -73,6 +73,7 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
         frames=FrameSettings(args.localisation, args.localisation_timeout, args.base_frame),
         detours=args.detours,
         watchdog=args.watchdog,
+        plan_timeout_s=args.plan_timeout,
     )
     driver.policy.check_beta(args.beta)
     driver.beta = args.beta
@@ -189,6 +190,12 @@ def _parser() -> argparse.ArgumentParser:
         default=FrameSettings.localisation_timeout_s,
         metavar="SECONDS",
         help="stand when the localisation's newest word is older (default: %(default)s; inf: never for that)",
+    )
+    parser.add_argument(
+        "--plan-timeout",
+        type=float,
+        metavar="SECONDS",
+        help="stand when the newest plan came longer ago, as after a goal was cancelled (default: plans do not age)",
     )
     parser.add_argument(
         "--detours",

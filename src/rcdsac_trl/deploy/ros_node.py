@@ -72,6 +72,7 @@ class PolicyNode(Node):
     def __init__(self) -> None:
         super().__init__("rcdsac_trl")
         agent = self._given("agent", "")
+        plan_timeout_s = self._given("plan_timeout_s", math.nan)  # NaN: never
         self._command_type = self._given("command_type", "TwistStamped")
         if self._command_type not in _COMMAND_TYPES:
             raise UserInputError(
@@ -92,6 +93,7 @@ class PolicyNode(Node):
             ),
             detours=self._given("detours", False),
             watchdog=self._given("watchdog", False),
+            plan_timeout_s=None if math.isnan(plan_timeout_s) else plan_timeout_s,
         )
         self._needed = {topic: _CLOUD for _, topic, _ in cameras} or {"scan": _SCAN}
         self._needed |= _NEEDED

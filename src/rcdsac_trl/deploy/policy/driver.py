@@ -1,6 +1,7 @@
 """The core of a ROS 2 node without ROS: it takes messages as they come, and gives a command when asked."""
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -66,10 +67,15 @@ class Driver:
             keeps clear of that, too, and so does the stop zone: of glass, which no sensor sees.
         watchdog: give the policy a navigator that turns beta to its boldest where the robot stands, and at last backs
             off; it needs numba, and reads the map as detours do.
+        plan_timeout_s: the robot stands when the newest path came longer ago, s, by the clock of :meth:`command`; None:
+            paths do not age. Planners that plan again and again fall silent when a goal is cancelled.
 
     Attributes:
         beta: how much risk to take; None: the policy's default. May be set at any time.
         situation: what the policy was asked on last; None where the last command did not ask it.
+
+    Raises:
+        UserInputError: if readings are to mean what they cannot, or the timeout is no positive number.
     """
 
     def __init__(
@@ -84,9 +90,15 @@ class Driver:
         frames: FrameSettings | None = None,
         detours: bool = False,
         watchdog: bool = False,
+        plan_timeout_s: float | None = None,
     ) -> None:
         check_meaning("zero_means", zero_means)
         check_meaning("nan_means", nan_means)
+        if plan_timeout_s is not None and not 0.0 < plan_timeout_s < math.inf:
+            raise UserInputError(
+                f"plan_timeout_s={plan_timeout_s} must be a positive number of seconds: leave it out for plans that do "
+                "not age"
+            )
         self.policy = policy
         if detours or watchdog:
             # Here, since a driver without them does without numba.
@@ -113,6 +125,9 @@ class Driver:
         self._follower: PathFollower | None = None
         self._path_frame = self._map_frame = ""
         self._no_path = "there is no path yet"
+        self._plan_timeout_s = plan_timeout_s
+        # Messages come between commands, and their stamps may say anything: inf is a path that no command has met.
+        self._planned_s = math.inf
 
     @property
     def arrived(self) -> bool:
@@ -205,6 +220,7 @@ class Driver:
             self._follower.replan(path)
         self._path_frame = frame
         self._no_path = ""
+        self._planned_s = math.inf
 
     def command(self, now_s: float) -> Command:
         """Return what the robot should do now; call it once in every control period.
@@ -224,6 +240,7 @@ class Driver:
             return self.policy.refuse(f"a message cannot be read ({described(error)})")
 
     def _ask(self, now_s: float) -> Command:
+        self._planned_s = min(self._planned_s, now_s)  # also where the clock was set back
         if self._faults:
             return self.policy.refuse(next(iter(self._faults.values())))
         if self._odometry is None:
@@ -234,8 +251,8 @@ class Driver:
         waypoints = self._follower.update(here)
         if waypoints is None:
             return self.policy.refuse("the goal is reached")
-        if (missing := self._missing()) is not None:
-            return self.policy.refuse(missing)
+        if (lacks := self._old_plan(now_s) or self._missing()) is not None:
+            return self.policy.refuse(lacks)
         ranges, scanned_s = self._ranges(pose_s)
         stamps = Stamps(now_s, scanned_s, pose_s, moved_s)
         velocity = messages.velocity_of_odometry(self._odometry)
@@ -244,6 +261,16 @@ class Driver:
         if self._map_frame not in ("", self._path_frame):
             on_map, _ = self._frames.robot_in(self._map_frame, now_s, "map")
         return self.policy.act(ranges, waypoints, velocity, self.beta, stamps=stamps, pose=on_map)
+
+    def _old_plan(self, now_s: float) -> str | None:
+        """Return how old the newest path is, where that is too old."""
+        age_s = now_s - self._planned_s
+        if self._plan_timeout_s is None or age_s <= self._plan_timeout_s:
+            return None
+        return (
+            f"the plan is {age_s:.2f} s old, more than plan_timeout_s={self._plan_timeout_s:g}: it was cancelled, or its "
+            "planner is late; plan again, or give a larger plan_timeout_s"
+        )
 
     def _located(self, now_s: float) -> tuple[tuple[float, float, float], float, float]:
         """Return the robot's pose in the path's frame, the stamp of that pose, and the stamp of the odometry."""
