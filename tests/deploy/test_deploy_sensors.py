@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rcdsac_trl.deploy import CameraPose, CloudFilter, Guard, Mount, Scan, Sectors, cloud_sectors, scan_sectors
 from rcdsac_trl.errors import UserInputError
+from rcdsac_trl.robot.robot_settings import PAPER
 from rcdsac_trl.robot.sectors import bins_of, nearest_by_sector
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.sim.lidar import sector_distances
@@ -167,6 +168,14 @@ def test_what_a_ray_says(values: list[float], distance: float, covered: bool) ->
     found = scan_sectors(scan(ranges, FULL / 1440, range_min=0.3))
     assert (found.distances_m[1], found.covered[1]) == (distance, covered)
     assert (np.delete(found.distances_m, 1) == 2.5).all()
+
+
+def test_docs_robot_says_which_rays_the_sparse_agent_needs() -> None:
+    sparse = PAPER.sensor_mask("sparse")
+    for angle_min in (-math.pi, 0.0, 0.3, math.radians(1.0)):
+        assert scan_sectors(scan(np.full(180, 2.0), angle_min)).covered[sparse].all()
+    assert scan_sectors(scan(np.full(18, 2.0), math.radians(19.0))).covered[sparse].all()
+    assert not scan_sectors(scan(np.full(90, 2.0), 0.0)).covered[sparse].any()  # evenly spaced, and between them all
 
 
 def test_only_what_is_in_view_is_covered() -> None:
