@@ -198,8 +198,8 @@ def aging(timeout_s: float | None) -> tuple[Driver, Callable[[float, float], str
 
 
 OLD = (
-    "the plan is 3.10 s old, more than plan_timeout_s=3: it was cancelled, or its planner is late; plan again, or give a "
-    "larger plan_timeout_s"
+    "the plan is 3.10 s old, more than plan_timeout_s=3: it was cancelled, or its planner is late; plan again, or give "
+    "a larger plan_timeout_s"
 )
 
 
@@ -213,7 +213,7 @@ def test_a_plan_ages_from_the_first_command_after_it_came_whatever_its_stamp() -
 
 
 def test_what_is_refused_for_an_old_plan_costs_no_progress() -> None:
-    """While plans were missing the robot was pushed past the corner: the next plan, the same, is followed from there."""
+    """While plans were missing the robot got past the corner: the next plan, the same, is followed from there."""
     driver, reason = aging(3.0)
     assert reason(100.0, 0.0) is None
     assert reason(103.1, 8.8) == OLD

@@ -268,8 +268,8 @@ class Driver:
         if self._plan_timeout_s is None or age_s <= self._plan_timeout_s:
             return None
         return (
-            f"the plan is {age_s:.2f} s old, more than plan_timeout_s={self._plan_timeout_s:g}: it was cancelled, or its "
-            "planner is late; plan again, or give a larger plan_timeout_s"
+            f"the plan is {age_s:.2f} s old, more than plan_timeout_s={self._plan_timeout_s:g}: it was cancelled, or "
+            "its planner is late; plan again, or give a larger plan_timeout_s"
         )
 
     def _located(self, now_s: float) -> tuple[tuple[float, float, float], float, float]:
