@@ -361,6 +361,19 @@ def test_a_pose_of_before_the_clock_was_set_back_counts_no_more(back_s: float) -
     assert frames.robot_in("map", now_s)[0] == (50.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("back_s", [0.001, 0.9])
+def test_an_odometry_that_is_late_costs_no_pose(back_s: float) -> None:
+    """A localisation that speaks only while the robot moves would not say it again."""
+    frames = RobotFrames(FrameSettings(localisation="pose", localisation_timeout_s=math.inf))
+    frames.moved("odom", "base_link", 10.0, (1.0, 0.0, 0.0))
+    frames.localised("map", 10.0, (5.0, 0.0, 0.0))
+    assert frames.robot_in("map", 10.0) == ((5.0, 0.0, 0.0), 10.0)
+    frames.moved("odom", "base_link", 10.0 - back_s, (0.9, 0.0, 0.0))
+    assert frames.robot_in("map", 10.0) == ((5.0, 0.0, 0.0), 10.0)  # the newest stamp counts, not what came last
+    frames.moved("odom", "base_link", 10.02, (1.1, 0.0, 0.0))
+    assert frames.robot_in("map", 10.02)[0] == pytest.approx((5.1, 0.0, 0.0))
+
+
 def test_broken_transforms_are_left_out_and_told_where_they_are_missed() -> None:
     found = Driver(Policy(agent()), mount=Mount())
     found.on_path(path([(9.0, 0.0)]))

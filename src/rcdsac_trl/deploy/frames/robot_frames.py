@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from rcdsac_trl.deploy.frames.rigid_transform import RigidTransform
-from rcdsac_trl.deploy.frames.transform_buffer import TransformBuffer, TransformError, named
+from rcdsac_trl.deploy.frames.transform_buffer import SET_BACK_S, TransformBuffer, TransformError, named
 from rcdsac_trl.deploy.policy.input_checks import InputLimits
 from rcdsac_trl.errors import UserInputError
 
@@ -98,8 +98,8 @@ class RobotFrames:
         """
         self._odom_frame = named(odom_frame)
         self._base_frame = named(self._settings.base_frame or base_frame or _USUAL_BASE)
-        if self._odometry.frames and stamp_s < self._odometry.latest(_START, _ROBOT)[1]:
-            # The clock was set back: nothing that was stamped before says where the robot is now.
+        if self._odometry.frames and stamp_s < self._odometry.latest(_START, _ROBOT)[1] - SET_BACK_S:
+            # Nothing that was stamped before the clock was set back says where the robot is now.
             self._odometry, self._localised, self._pose = TransformBuffer(), TransformBuffer(), None
         self._odometry.set(_START, _ROBOT, stamp_s, RigidTransform.planar(*pose))
 

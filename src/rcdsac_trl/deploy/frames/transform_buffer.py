@@ -13,9 +13,9 @@ from rcdsac_trl.errors import UserInputError
 
 ALWAYS_S = math.inf
 """Stamp of what does not change: it is never old."""
+SET_BACK_S = 1.0
+"""Publishers of one link are late by less; who goes back by more was started again, with another clock."""
 
-# Publishers of one link are late by less; who goes back by more was started again, with another clock.
-_SET_BACK_S = 1.0
 # Frames that are named in a sentence.
 _MOST_NAMED = 8
 # No tree of a robot has a branch so long; a longer one is a loop.
@@ -89,7 +89,7 @@ class TransformBuffer:
         if static:
             self._links[child] = _Link(parent, True, [stamp_s], [transform])
             return
-        again = link is not None and not link.static and stamp_s < link.stamps_s[-1] - _SET_BACK_S
+        again = link is not None and not link.static and stamp_s < link.stamps_s[-1] - SET_BACK_S
         if link is None or link.static or link.parent != parent or again:
             link = self._links[child] = _Link(parent, False)
         place = bisect.bisect_left(link.stamps_s, stamp_s)
