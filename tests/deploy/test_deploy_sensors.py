@@ -183,6 +183,64 @@ def test_only_what_is_in_view_is_covered() -> None:
     assert np.flatnonzero(found.covered).tolist() == [*range(46), *range(135, 180)]
 
 
+# ------------------------------------------------------------------------------------------------ a scanner that moves
+def one_ray(ray: int, distance_m: float, **more: Any) -> Sectors:
+    """See one thing with 361 rays from -180 to 180 degrees, one a degree."""
+    ranges = np.full(361, np.inf)
+    ranges[ray] = distance_m
+    return scan_sectors(scan(ranges, -math.pi, math.radians(1.0), **more))
+
+
+def test_a_ray_is_placed_where_the_scanner_was_when_it_was_measured() -> None:
+    """Ray 270 looks to the left, 90 degrees, after three quarters of the sweep."""
+    # From (-0.2, 0) turned by -20 to (0.2, 0) turned by 16: then it was at (0.1, 0), turned by 7 degrees.
+    start, end = Mount(-0.2, 0.0, math.radians(-20.0)), Mount(0.2, 0.0, math.radians(16.0))
+    found = one_ray(270, 2.0, mount=start, end_mount=end)
+    x, y = 0.1 - 2.0 * math.sin(math.radians(7.0)), 2.0 * math.cos(math.radians(7.0))
+    (sector,) = np.flatnonzero(np.isfinite(found.distances_m))
+    assert sector == 47  # atan2(y, x) is 94.1 degrees
+    assert found.distances_m[sector] == pytest.approx(math.hypot(x, y))
+    # Upside down the same ray looks to the right.
+    start, end = (Mount(mount.x_m, 0.0, mount.yaw_rad, upside_down=True) for mount in (start, end))
+    found = one_ray(270, 2.0, mount=start, end_mount=end)
+    (sector,) = np.flatnonzero(np.isfinite(found.distances_m))
+    assert sector == 139  # (0.1 + 2 sin 7, -2 cos 7): -80.3 degrees
+    assert found.distances_m[sector] == pytest.approx(math.hypot(0.1 + 2.0 * math.sin(math.radians(7.0)), y))
+
+
+def test_a_scanner_turns_by_the_shorter_way() -> None:
+    """From 175 to -175 degrees are 10: the middle ray, straight ahead, was measured at 180."""
+    found = one_ray(180, 2.0, mount=Mount(yaw_rad=math.radians(175.5)), end_mount=Mount(yaw_rad=math.radians(-174.5)))
+    assert np.flatnonzero(np.isfinite(found.distances_m)).tolist() == [90]  # 180.5 degrees
+
+
+def test_what_a_turn_against_the_sweep_leaves_out_is_not_covered() -> None:
+    # 18 degrees to the right in a sweep to the left: it ends 18 degrees short of where it began, at 180.
+    found = one_ray(0, math.inf, end_mount=Mount(yaw_rad=math.radians(-18.0)))
+    assert np.flatnonzero(~found.covered).tolist() == [*range(82, 90)]  # [164, 180) degrees; one ray is at 162
+    assert one_ray(0, math.inf, end_mount=Mount(yaw_rad=math.radians(18.0))).covered.all()
+
+
+def test_a_scanner_that_did_not_move_sees_the_same_to_the_last_bit() -> None:
+    ranges = stream(3, "standing").uniform(0.3, 4.0, 500)
+    for mount in (Mount(), Mount(0.1, -0.2, 2.0), Mount(0.0, 0.05, -1.0, upside_down=True)):
+        still, stands = (scan_sectors(scan(ranges, mount=mount, end_mount=end)) for end in (None, mount))
+        np.testing.assert_array_equal(still.distances_m, stands.distances_m)
+        np.testing.assert_array_equal(still.covered, stands.covered)
+
+
+@pytest.mark.parametrize(
+    ("end_mount", "told"),
+    [
+        ((0.1, 0.0, 0.0), "the scan's end_mount is a tuple: give a Mount"),
+        (Mount(upside_down=True), "one upside down, one not: give both alike"),
+    ],
+)
+def test_a_scanner_that_cannot_have_moved_so_is_refused(end_mount: Any, told: str) -> None:
+    with pytest.raises(UserInputError, match=told):
+        one_ray(0, 1.0, end_mount=end_mount)
+
+
 def test_the_robot_itself_is_left_out() -> None:
     ranges = np.full(360, 0.12)
     ranges[90] = 1.0

@@ -281,6 +281,80 @@ def test_a_scan_is_taken_from_where_the_robot_was_when_it_was_made() -> None:
     )
 
 
+def swept(now_s: float, ranges: list[float], time_increment: float) -> SimpleNamespace:
+    """Scan from -180 degrees to the left, a ray a degree."""
+    message = laser(now_s, ranges)
+    message.time_increment = time_increment
+    return message
+
+
+def nearest_of(scan: Any) -> tuple[int, float]:
+    """Return the one sector of a scan in which something is, and how far."""
+    found = scan_sectors(scan)
+    (sector,) = np.flatnonzero(np.isfinite(found.distances_m))
+    return int(sector), float(found.distances_m[sector])
+
+
+def test_while_turning_every_ray_is_taken_from_the_heading_at_its_time() -> None:
+    """5 Hz, 90 degrees/s to the left: ray 260 looks 80 degrees to the left, 0.144 s after the stamp, at 13 degrees.
+
+    So what it sees is at 93 degrees, and 75 from the heading of 18 degrees that the robot has at the end.
+    """
+    ranges = [math.inf] * 360
+    ranges[260] = 1.0
+    for time_increment, sector in ((0.2 / 360, 37), (0.0, 31)):  # else at 80 degrees, and 62 at the end
+        found, policy = driver(mount=Mount())
+        found.on_path(path([(9.0, 0.0)]))
+        for step in range(11):
+            now = 10.0 + 0.02 * step
+            found.on_odometry(odometry(now, 0.0, 0.0, math.radians(90.0 * 0.02 * step)))
+            found.on_scan(swept(10.0, ranges, time_increment))
+            assert found.command(now).reason is None
+        assert nearest_of(policy.given["ranges"]) == (sector, pytest.approx(1.0))
+
+
+def test_while_driving_every_ray_is_taken_from_the_place_at_its_time() -> None:
+    """0.5 m/s: ray 180 looks ahead 0.1 s after the stamp, when the robot has done 5 cm of the 10 that it does."""
+    ranges = [math.inf] * 360
+    ranges[180] = 1.0
+    for time_increment, distance_m in ((0.2 / 360, 0.95), (0.0, 0.9)):
+        found, policy = driver(mount=Mount())
+        found.on_path(path([(9.0, 0.0)]))
+        for now, x_m in ((10.0, 0.0), (10.2, 0.1)):
+            found.on_odometry(odometry(now, x_m, 0.0))
+            found.on_scan(swept(10.0, ranges, time_increment))
+            assert found.command(now).reason is None
+        assert nearest_of(policy.given["ranges"]) == (0, pytest.approx(distance_m))
+
+
+def test_rays_that_are_newer_than_odometry_are_taken_from_where_the_robot_was_last_seen() -> None:
+    """Odometry ends in the middle of the sweep: at its end the robot still counts as there, 5 cm on."""
+    ranges = [math.inf] * 360
+    found, policy = driver(mount=Mount())
+    found.on_path(path([(9.0, 0.0)]))
+    for now, x_m in ((10.0, 0.0), (10.1, 0.05)):
+        found.on_odometry(odometry(now, x_m, 0.0))
+        found.on_scan(swept(10.0, ranges, 0.2 / 360))
+        assert found.command(now).reason is None
+    scan = policy.given["ranges"]
+    assert (scan.mount.x_m, scan.end_mount.x_m) == pytest.approx((-0.05, 0.0))
+
+
+@pytest.mark.parametrize("time_increment", [0.0, -0.001, math.nan, math.inf, 1.01 / 359])
+def test_a_time_increment_that_says_nothing_is_as_good_as_none(time_increment: float) -> None:
+    found, policy = driver(mount=Mount(0.1, 0.0, 0.3))
+    found.on_path(path([(9.0, 0.0)]))
+    for now, x_m in ((10.0, 0.0), (10.2, 0.1)):
+        found.on_odometry(odometry(now, x_m, 0.0, 0.5))
+        found.on_scan(laser(10.0))  # without that field
+        found.command(now)
+    plain = policy.given["ranges"]
+    found.on_scan(swept(10.0, [2.0] * 360, time_increment))
+    assert found.command(10.2).reason is None
+    np.testing.assert_equal(vars(policy.given["ranges"]), vars(plain))
+    assert plain.end_mount is None
+
+
 def test_a_pose_topic_stands_in_for_tf_and_holds_on_while_odometry_goes_on() -> None:
     found, policy = driver(mount=Mount(), frames=FrameSettings(localisation="pose"))
     found.on_path(path([(0.0, 0.0), (9.0, 0.0)], "map"))

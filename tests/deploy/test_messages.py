@@ -20,6 +20,7 @@ from rcdsac_trl.deploy.ros.messages import (
     rosbags_maker,
     scan_of,
     stamp_s,
+    sweep_s,
     twist_stamped,
     velocity_of_odometry,
 )
@@ -116,6 +117,10 @@ def test_laser_odometry_and_path() -> None:
     scan = scan_of(laser(0.0), mount)
     assert (scan.range_min, scan.range_max, scan.mount) == (single(0.1), 10.0, mount)
     assert scan_sectors(scan_of(laser(0.0))).distances_m.tolist() == [2.0] * 180
+    message = laser(0.0)
+    assert sweep_s(message) == 0.0
+    message.time_increment = single(0.0005)
+    assert sweep_s(message) == pytest.approx(0.1795)  # from the first of 360 rays to the last
     message = odometry(0.0, (1.0, 2.0, -2.5))
     assert pose_of_odometry(message) == pytest.approx((1.0, 2.0, -2.5))
     assert velocity_of_odometry(message) == (0.3, -0.2)

@@ -154,7 +154,7 @@ class RobotFrames:
 
         Args:
             frame: of the sensor.
-            stamp_s: of what it measured.
+            stamp_s: of what it measured; where odometry has not come so far, the robot is where it was by the newest.
             robot_s: when the robot's frame is meant.
             given: where it sits on the robot; None: as ``/tf`` says.
             untold: where it sits where nobody publishes any transform; None: that is refused.

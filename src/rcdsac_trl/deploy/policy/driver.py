@@ -3,7 +3,7 @@
 import contextlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,8 +51,9 @@ class Driver:
     A message that cannot be read is as good as none: the robot stands until a good one follows. A path in another frame
     than odometry, such as ``map``, needs transforms or poses that connect the two; see
     :class:`~rcdsac_trl.deploy.frames.robot_frames.RobotFrames`. What a sensor saw at its stamp is brought to where the
-    robot is by then. A path in the frame of the one before is followed from where the robot has got to on that one; see
-    :meth:`PathFollower.replan`.
+    robot is by then; of a scan with a ``time_increment``, every ray from where the robot was when it was measured. What
+    is newer than odometry counts as measured where the robot was by the newest. A path in the frame of the one before
+    is followed from where the robot has got to on that one; see :meth:`PathFollower.replan`.
 
     Args:
         policy: that drives.
@@ -304,9 +305,10 @@ class Driver:
         """
         if not self._cameras:
             scanned_s = messages.stamp_s(self._scan)
-            frame = str(self._scan.header.frame_id)
-            there = self._frames.sensor(frame, scanned_s, pose_s, self._mount, self._own_mount)
-            return messages.scan_of(self._scan, mount_of(there), *self._meanings), scanned_s
+            scan = messages.scan_of(self._scan, self._scanner(scanned_s, pose_s), *self._meanings)
+            if swept_s := messages.sweep_s(self._scan):
+                scan = replace(scan, end_mount=self._scanner(scanned_s + swept_s, pose_s))
+            return scan, scanned_s
         clouds, stamps = [], []
         for frame, camera in self._cameras.items():
             message = self._clouds[frame]
@@ -315,3 +317,8 @@ class Driver:
             there = self._frames.sensor(frame, stamps[-1], pose_s, given)
             clouds.append((messages.points_of(message), camera_of(there, camera, frame)))
         return cloud_sectors(clouds, self._filter, self._robot.lidar.max_range_m), min(stamps)
+
+    def _scanner(self, at_s: float, pose_s: float) -> Mount:
+        """Return where the scanner was at a time, around where the robot was at another."""
+        frame = str(self._scan.header.frame_id)
+        return mount_of(self._frames.sensor(frame, at_s, pose_s, self._mount, self._own_mount))

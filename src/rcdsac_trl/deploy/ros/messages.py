@@ -22,6 +22,8 @@ from rcdsac_trl.robot.sectors import Mount, is_finite_number
 
 # Drivers count the last angle to the last ray or to the one after it; more is another unit, or number of rays.
 _ANGLE_SLACK_RAYS, _ANGLE_SLACK_SHARE = 2.0, 0.05
+# No scanner of a robot takes longer from its first ray to its last.
+_LONGEST_SWEEP_S = 1.0
 # builtin_interfaces/Time holds whole seconds in 32 bits.
 _LAST_STAMP_S = 2.0**31
 # A cell of a nav_msgs/OccupancyGrid that is occupied with so much probability is; -1 is unknown.
@@ -76,6 +78,17 @@ def scan_of(
         zero_means=zero_means,
         nan_means=nan_means,
     )
+
+
+def sweep_s(message: Any) -> float:
+    """Return how long after its stamp, which is of the first ray, the last one of a ``sensor_msgs/LaserScan`` was seen.
+
+    Returns:
+        s; 0 where the message does not say it. A ``time_increment`` that is negative, not finite, or makes more than
+        1 s of a sweep is none: drivers that do not know it write anything there.
+    """
+    swept_s = float(getattr(message, "time_increment", 0.0)) * (len(message.ranges) - 1)
+    return swept_s if 0.0 < swept_s <= _LONGEST_SWEEP_S else 0.0
 
 
 def _check_angles(message: Any, rays: int) -> None:

@@ -64,11 +64,13 @@ class Scan:
         angle_increment: from one ray to the next, rad; negative for a scan that runs clockwise.
         range_min: smallest distance that the sensor measures, m.
         range_max: largest one, m; may be ``inf``.
-        mount: where the sensor sits.
+        mount: where the sensor sits; of one that moves while it turns, where it was at its first ray.
         zero_means: what the driver means by a reading of 0: ``"invalid"``, ``"far"`` if it writes 0 where nothing is,
             or ``"near"`` if it does where something is too near. With ``"far"`` a sensor that fails with zeros reads
             as open space.
         nan_means: the same of NaN.
+        end_mount: where the sensor was at its last ray, in the frame of `mount`; from the one to the other it moved
+            evenly, by the shorter turn. None: all rays were measured from `mount`.
     """
 
     ranges: ArrayLike
@@ -79,6 +81,7 @@ class Scan:
     mount: Mount = field(default_factory=Mount)
     zero_means: Meaning = "invalid"
     nan_means: Meaning = "invalid"
+    end_mount: Mount | None = None
 
 
 def check_meaning(name: str, value: object) -> None:
@@ -96,7 +99,8 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_
 
     A sector is covered if at least one ray points into it and at least half of those that do say something. Points
     are taken from the robot's centre; a sensor that sits elsewhere sees sectors a little askew, so mount it within
-    0.3 m of the centre.
+    0.3 m of the centre. Where a sensor turned against its sweep, sectors between its last and its first ray were not
+    seen, and are not covered.
 
     Args:
         scan: of any angle range and direction.
@@ -105,7 +109,8 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_
 
     Raises:
         UserInputError: if the scan cannot be one: no ray, an increment of 0, angles in degrees, limits that are no
-            numbers, a sensor that does not reach as far as the agent sees, or readings that are not in metres.
+            numbers, a sensor that does not reach as far as the agent sees or that turned over on its way, or readings
+            that are not in metres.
 
     Example:
         >>> scan = Scan(np.full(360, 2.0), -math.pi, math.radians(1.0), 0.1, 10.0)
@@ -121,14 +126,15 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_
         silent = np.isnan(ranges) | (ranges < scan.range_min) & ~too_near
         ranges = np.where(ranges > scan.range_max, np.inf, ranges)
         ranges[too_near] = scan.range_min
-    mount = scan.mount
-    turn = -1.0 if mount.upside_down else 1.0
-    angles = mount.yaw_rad + turn * (scan.angle_min + scan.angle_increment * np.arange(len(ranges)))
+    turn = -1.0 if scan.mount.upside_down else 1.0
+    places = _places(scan, len(ranges))
+    angles = places[2] + turn * (scan.angle_min + scan.angle_increment * np.arange(len(ranges)))
     bearings = bins_of(angles)
     hits = ~silent & np.isfinite(ranges)
     distances, bins = ranges[hits], bearings[hits]
-    if (mount.x_m, mount.y_m) != (0.0, 0.0):
-        x, y = mount.x_m + distances * np.cos(angles[hits]), mount.y_m + distances * np.sin(angles[hits])
+    if places[:2].any():
+        x_m, y_m = places[:2] if scan.end_mount is None else places[:2, hits]
+        x, y = x_m + distances * np.cos(angles[hits]), y_m + distances * np.sin(angles[hits])
         distances, bins = np.hypot(x, y), bins_of(np.arctan2(y, x))
     own = distances < body_radius_m
     silent[np.flatnonzero(hits)[own]] = True
@@ -137,6 +143,17 @@ def scan_sectors(scan: Scan, *, body_radius_m: float = BODY_RADIUS_M, max_range_
     nearest = nearest_by_sector(bins[~own], distances[~own], max_range_m=max_range_m)
     # Something that is seen is seen, whatever the other rays of its sector say.
     return Sectors(nearest, covered | np.isfinite(nearest), max_range_m)
+
+
+def _places(scan: Scan, rays: int) -> NDArray[np.float64]:
+    """Return x and y in m and yaw in rad of the sensor, [3, 1]; of one that moved at each ray, [3, rays]."""
+    start, end = scan.mount, scan.end_mount
+    first = np.array([[start.x_m], [start.y_m], [start.yaw_rad]])
+    if end is None:
+        return first
+    turned_rad = math.remainder(end.yaw_rad - start.yaw_rad, 2.0 * math.pi)
+    way = np.array([[end.x_m - start.x_m], [end.y_m - start.y_m], [turned_rad]])
+    return first + way * np.linspace(0.0, 1.0, rays)
 
 
 def unsaid_readings(scan: Scan) -> dict[str, int]:
@@ -153,8 +170,11 @@ def _checked(scan: Scan, max_range_m: float) -> NDArray[np.float64]:
     ranges = numbers_of(scan.ranges, "the scan's ranges")
     if ranges.ndim != 1 or not 0 < len(ranges) <= _MOST_RAYS:
         raise UserInputError(f"the scan's ranges have shape {list(ranges.shape)}: give one number for each ray")
-    if not isinstance(scan.mount, Mount):
-        raise UserInputError(f"the scan's mount is a {type(scan.mount).__name__}: give a Mount")
+    for name, mount in (("mount", scan.mount), ("end_mount", scan.mount if scan.end_mount is None else scan.end_mount)):
+        if not isinstance(mount, Mount):
+            raise UserInputError(f"the scan's {name} is a {type(mount).__name__}: give a Mount")
+        if mount.upside_down != scan.mount.upside_down:
+            raise UserInputError("the scan's mount and end_mount are one upside down, one not: give both alike")
     check_meaning("zero_means", scan.zero_means)
     check_meaning("nan_means", scan.nan_means)
     _check_angles(scan, len(ranges))
