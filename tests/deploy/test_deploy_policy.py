@@ -13,8 +13,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcdsac_trl.deploy import Guard, InputLimits, Policy, Scan, Sectors, Stamps
+from rcdsac_trl.deploy import Guard, InputLimits, Mount, Policy, Scan, Sectors, Stamps
 from rcdsac_trl.deploy.export.modules import ActorStep, CriticStep
+from rcdsac_trl.deploy.sensors.scan import scan_sectors
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.action import desired_velocities
 from rcdsac_trl.robot.observation import range_observation, waypoint_observation
@@ -312,6 +313,20 @@ def test_a_few_lost_bins_read_as_nothing_there() -> None:
     assert command.wanted == Policy(agent()).act(OPEN, AHEAD, STANDING).wanted
     strict = Policy(agent(), limits=InputLimits(max_lost_share=0.0))
     assert strict.act(Sectors(lost, np.arange(180) != 5), AHEAD, STANDING).stopped
+
+
+@pytest.mark.parametrize(("increment", "turned_deg", "drives"), [(1, -18, True), (1, -40, False), (-1, 18, True)])
+def test_what_a_turning_scanner_leaves_out_ahead_is_no_blindness(increment: int, turned_deg: int, drives: bool) -> None:
+    """A sweep that begins ahead, on a robot that turns against it: at 5 Hz and 90 degrees/s 18 degrees are left out."""
+    turned = Mount(yaw_rad=math.radians(turned_deg))
+    scan = Scan(np.full(360, 2.0), 0.0, math.radians(increment), 0.1, 10.0, end_mount=turned)
+    lost = np.count_nonzero(~scan_sectors(scan).covered)
+    assert lost == pytest.approx(abs(turned_deg) / 2.0, abs=1.0)
+    assert lost > 0.1 * 43
+    command = Policy(agent()).act(scan, AHEAD, STANDING)
+    assert command.stopped is not drives
+    still = Scan(np.where(np.arange(360) < 18, np.nan, 2.0), 0.0, math.radians(increment), 0.1, 10.0)
+    assert "not measured" in str(Policy(agent()).act(still, AHEAD, STANDING).reason)
 
 
 def test_one_waypoint_stands_for_both() -> None:

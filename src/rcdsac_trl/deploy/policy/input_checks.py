@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rcdsac_trl.deploy.sensors.arrays import is_plural, masked, numbers_of
-from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, unsaid_readings
+from rcdsac_trl.deploy.sensors.scan import Scan, scan_sectors, unsaid_readings, unswept_rad
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.observation import MIN_RANGE_M, WAYPOINT_DISTANCE_LIMITS_M
-from rcdsac_trl.robot.range_sensor import NUM_BINS
+from rcdsac_trl.robot.range_sensor import BIN_RAD, NUM_BINS
 from rcdsac_trl.robot.robot_settings import PAPER, RobotSettings
 from rcdsac_trl.robot.sectors import Sectors, is_finite_number
 
@@ -33,6 +33,8 @@ _LAST_STAMP_S = 1e11
 _COARSEST_STAMP_S = 0.01
 # So far apart are clocks that have nothing to do with each other.
 _OTHER_CLOCK_S = 60.0
+# A 5 Hz scanner on a robot that turns at 2 rad/s.
+_MOST_LEFT_OUT_RAD = 0.4
 _LARGEST_AGE_S = 10.0
 
 
@@ -63,7 +65,8 @@ class InputLimits:
 
     Attributes:
         max_age_s: of any part of the input.
-        max_lost_share: of the agent's range bins, how many may be without measurement; those read "nothing there".
+        max_lost_share: of the agent's range bins, how many may be without measurement; those read "nothing there". What
+            a scanner leaves out that turns against its sweep does not count, up to 0.4 rad.
     """
 
     max_age_s: float = 0.35
@@ -199,7 +202,9 @@ def _check_ranges(known: NDArray[np.float64]) -> None:
 
 def _check_lost(mask: NDArray[np.bool_], covered: NDArray[np.bool_], limits: InputLimits, scan: Scan | None) -> None:
     """Refuse a sensor that says too little about the agent's range bins."""
-    lost = np.count_nonzero(mask & ~covered) / np.count_nonzero(mask)
+    # A sensor that leaves out what it turns away from is not blind: that was seen a sweep before.
+    left_out = 0 if scan is None else math.ceil(min(unswept_rad(scan), _MOST_LEFT_OUT_RAD) / BIN_RAD)
+    lost = max(0, np.count_nonzero(mask & ~covered) - left_out) / np.count_nonzero(mask)
     if lost <= limits.max_lost_share:
         return
     why = "is the sensor blind, or of another kind?"

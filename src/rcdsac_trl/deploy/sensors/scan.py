@@ -151,9 +151,27 @@ def _places(scan: Scan, rays: int) -> NDArray[np.float64]:
     first = np.array([[start.x_m], [start.y_m], [start.yaw_rad]])
     if end is None:
         return first
-    turned_rad = math.remainder(end.yaw_rad - start.yaw_rad, 2.0 * math.pi)
-    way = np.array([[end.x_m - start.x_m], [end.y_m - start.y_m], [turned_rad]])
+    way = np.array([[end.x_m - start.x_m], [end.y_m - start.y_m], [_turned_rad(start, end)]])
     return first + way * np.linspace(0.0, 1.0, rays)
+
+
+def _turned_rad(start: Mount, end: Mount) -> float:
+    return math.remainder(end.yaw_rad - start.yaw_rad, 2.0 * math.pi)
+
+
+def unswept_rad(scan: Scan) -> float:
+    """Return how much of a full turn a sensor left out that turned against its sweep, rad; 0 of any other.
+
+    Example:
+        >>> turned = Mount(yaw_rad=-0.1)
+        >>> unswept_rad(Scan(np.full(360, 2.0), 0.0, math.radians(1.0), 0.1, 10.0, end_mount=turned))
+        0.1
+    """
+    if scan.end_mount is None:
+        return 0.0
+    turned_rad = _turned_rad(scan.mount, scan.end_mount)
+    swept = -scan.angle_increment if scan.mount.upside_down else scan.angle_increment
+    return max(0.0, -math.copysign(1.0, swept) * turned_rad)
 
 
 def unsaid_readings(scan: Scan) -> dict[str, int]:
