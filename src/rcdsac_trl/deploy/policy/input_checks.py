@@ -204,7 +204,7 @@ def _check_lost(mask: NDArray[np.bool_], covered: NDArray[np.bool_], limits: Inp
     """Refuse a sensor that says too little about the agent's range bins."""
     # A sensor that leaves out what it turns away from is not blind: that was seen a sweep before.
     left_out = 0 if scan is None else math.ceil(min(unswept_rad(scan), _MOST_LEFT_OUT_RAD) / BIN_RAD)
-    lost = max(0, np.count_nonzero(mask & ~covered) - left_out) / np.count_nonzero(mask)
+    lost = max(0, int(np.count_nonzero(mask & ~covered)) - left_out) / np.count_nonzero(mask)
     if lost <= limits.max_lost_share:
         return
     why = "is the sensor blind, or of another kind?"
