@@ -1,5 +1,6 @@
 """The search: trials are worth what their validations say, bad ones are pruned, and a killed search goes on."""
 
+import fcntl
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
@@ -221,6 +222,52 @@ def test_storage_may_be_a_database(trained: Callable) -> None:
     again.run()
     assert len(again.study.trials) == 2
     again.study._storage.remove_session()
+
+
+def test_a_trial_in_another_folder_is_not_lost(
+    trained: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Another node, with a disk of its own: only the storage is common."""
+    shared = f"search.storage='sqlite:///{tmp_path / 'all.db'}'"
+    seen: list[str] = []
+
+    def look() -> None:
+        (tmp_path / "elsewhere").mkdir()
+        monkeypatch.chdir(tmp_path / "elsewhere")
+        other = made("search.trials=9", shared)
+        other._take_up_what_was_lost()
+        seen.extend(trial.state.name for trial in other.study.trials)
+        other.study._storage.remove_session()
+        monkeypatch.chdir(tmp_path)
+
+    trained(look)
+    mine = made("search.trials=1", shared)
+    with pytest.raises(KeyboardInterrupt):
+        mine.run()
+    assert seen == ["RUNNING"]
+    mine._take_up_what_was_lost()
+    assert [trial.state.name for trial in mine.study.trials] == ["FAIL", "WAITING"]
+    mine.study._storage.remove_session()
+
+
+def test_no_search_looks_while_another_takes_a_trial(trained: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial that was lost is running as soon as it is asked for, and held only then."""
+    trained(State("interrupted"))
+    with pytest.raises(KeyboardInterrupt):
+        made("search.trials=1").run()
+    ask, waits = Search._ask, []
+
+    def asking(mine: Search) -> object:
+        trial = ask(mine)
+        with (mine.folder / "turn.lock").open("a") as file, pytest.raises(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        waits.append(trial.user_attrs["folder"])
+        return trial
+
+    monkeypatch.setattr(Search, "_ask", asking)
+    trained(GOOD)
+    made("search.trials=1").run()
+    assert waits == ["trial-0000"]
 
 
 def test_three_real_trials_and_a_restart(calls: Calls, tmp_path: Path) -> None:

@@ -6,8 +6,10 @@ that it can be pruned. Everything Optuna knows is in its storage: a search that 
 were lost, from their checkpoints, and several processes may search together.
 """
 
+import contextlib
+import fcntl
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 CONFIG = "search"
 _OWN = ("search", "space")
 _FOLDER, _ASKED = "folder", "asked"
+_TURN = "turn.lock"
 _LOCK = "search.lock"  # held by the search whose trial it is: the training takes its own only seconds later
 _WORTH = ("collision_cost", "averaged_validations")  # what a trial is worth depends on these
 _SILENCE_S = 60.0  # a trial takes many minutes, and its own folder tells more
@@ -143,15 +146,37 @@ class Search:
         )
         with never_silent(_SILENCE_S), Work(doing, left, "trial") as work:
             while (done := len(self._done())) < settings.trials:
-                self._take_up_what_was_lost()
-                trial = self._ask()
-                state = self._try(trial)
+                with self._turn():
+                    self._take_up_what_was_lost()
+                    trial = self._ask()
+                    claim = self._claim(trial)
+                try:
+                    state = self._try(trial)
+                finally:
+                    claim.close()
                 value = self._tell(trial, state)
                 print(f"{done + 1}/{settings.trials} {self._described(trial, state, value)}", flush=True)
                 if state.name == "interrupted":
                     raise KeyboardInterrupt
                 work.end_unit()
         self._conclude()
+
+    @contextlib.contextmanager
+    def _turn(self) -> Iterator[None]:
+        """Wait until no other search of this folder chooses: a trial is there before it is said whose it is."""
+        with (self.folder / _TURN).open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+    def _claim(self, trial: "optuna.Trial") -> FolderLock:
+        """Make the folder of a trial and hold it; what is not held is lost."""
+        name = trial.user_attrs.get(_FOLDER, f"trial-{trial.number:04d}")
+        folder = self.folder / name
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(folder, _LOCK)
+        if _FOLDER not in trial.user_attrs:
+            trial.set_user_attr(_FOLDER, name)
+        return lock
 
     def _done(self) -> set[str]:
         """Name the folders of the trials that need no more; a lost one shares its with the one that takes it up."""
@@ -176,7 +201,7 @@ class Search:
     @staticmethod
     def _is_alive(folder: Path) -> bool:
         if not folder.is_dir():
-            return False
+            return True  # for all that is known here: it is of a search in another folder, or on another disk
         try:
             for name in (_LOCK, "lock"):  # a training that lost its search ends with its checkpoint
                 FolderLock(folder, name).close()
@@ -186,11 +211,10 @@ class Search:
 
     def _try(self, trial: "optuna.Trial") -> State:
         overrides = [f"{key}={kind.suggest(trial, key)}" for key, kind in self.searched.items()]
-        if _FOLDER not in trial.user_attrs:
-            trial.set_user_attr(_FOLDER, f"trial-{trial.number:04d}")
         name = trial.user_attrs[_FOLDER]
-        folder = (self.folder / name).absolute()
-        job = replace(self.trial, name=name, folder=folder, overrides=(*self.trial.overrides, *overrides))
+        job = replace(
+            self.trial, name=name, folder=(self.folder / name).absolute(), overrides=(*self.trial.overrides, *overrides)
+        )
         reported: set[int] = set()
 
         def is_hopeless() -> bool:
@@ -200,15 +224,7 @@ class Search:
                     trial.report(value, iteration)
             return bool(reported) and trial.should_prune()
 
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            lock = FolderLock(folder, _LOCK)
-        except UserInputError as error:  # two searches took it up at the same moment
-            return State("failed", str(error))
-        try:
-            return execute(job, should_stop=is_hopeless)
-        finally:
-            lock.close()
+        return execute(job, should_stop=is_hopeless)
 
     def _values(self, folder: Path) -> dict[int, float]:
         """Read what each validation of a run is worth, by iterations done."""
