@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from rcdsac_trl.deploy.navigation.static_layer import Pose
 
 
-class _Place(NamedTuple):
+class _Moment(NamedTuple):
     """What the guard limits a command by.
 
     Attributes:
@@ -412,7 +412,7 @@ class Policy:
             self._see(*seen, context)
             self._asked_at = measured
         moved = self._moved(measured, self._periods.since_asked_s(stamps))
-        return self._command(_Place(sectors, measured, ahead, on_map, moved), fresh, fresh and forgot)
+        return self._command(_Moment(sectors, measured, ahead, on_map, moved), fresh, fresh and forgot)
 
     def _moved(self, measured: tuple[float, float], elapsed_s: float) -> NDArray[np.float64]:
         """Return how the robot has moved since the agent was asked, by the velocities then and now."""
@@ -428,11 +428,11 @@ class Policy:
         self._told = self._networks.see(bins, vectors, context)
         return self._told
 
-    def _command(self, place: _Place, fresh: bool, forgot: bool) -> Command:
+    def _command(self, moment: _Moment, fresh: bool, forgot: bool) -> Command:
         outlook = self._told
         assert outlook is not None
         wish, reasons = self._wish(outlook)
-        driven, limit = self._limited(wish, place)
+        driven, limit = self._limited(wish, moment)
         if limit is not None:
             reasons.insert(0, f"limited by {limit}; it ends when the cause does")
         # Networks are told what the robot was told: the limits are part of the world.
@@ -448,26 +448,26 @@ class Policy:
             return outlook.wanted, ["it stands still, so beta turns to its boldest until it gets on"]
         return outlook.wanted, []
 
-    def _limited(self, wish: tuple[float, float], place: _Place) -> tuple[tuple[float, float], str | None]:
+    def _limited(self, wish: tuple[float, float], moment: _Moment) -> tuple[tuple[float, float], str | None]:
         """Return the velocities that the guard allows, and what limits them; None where nothing does."""
         if self.guard is None:
             return wish, None
         # A latency is counted from the measurement: what is allowed for there is late no more.
         guard = self.guard.later(max(0.0, self._periods.age_s - self._latency_s))
-        been = None if self._advice is None else seen_from(self._advice.been, place.moved)
-        reach_m = guard.reach_m(abs(wish[0]), place.ahead)
-        v, omega, limit = guard.limit(*wish, self._known(place, reach_m), place.measured, been, place.ahead)
-        if place.on_map is not None and limit:
-            unmapped = self._known(place._replace(on_map=None), reach_m)
-            if not guard.limit(*wish, unmapped, place.measured, been, place.ahead)[2]:
+        been = None if self._advice is None else seen_from(self._advice.been, moment.moved)
+        reach_m = guard.reach_m(abs(wish[0]), moment.ahead)
+        v, omega, limit = guard.limit(*wish, self._known(moment, reach_m), moment.measured, been, moment.ahead)
+        if moment.on_map is not None and limit:
+            unmapped = self._known(moment._replace(on_map=None), reach_m)
+            if not guard.limit(*wish, unmapped, moment.measured, been, moment.ahead)[2]:
                 limit += " around what the map shows"
         return (v, omega), limit
 
-    def _known(self, place: _Place, reach_m: float) -> Sectors:
+    def _known(self, moment: _Moment, reach_m: float) -> Sectors:
         """Return what the stop zone minds: what is sensed, and what the navigator knows besides."""
         if self.navigator is None:
-            return place.sectors
-        return self.navigator.known(place.sectors, place.on_map, reach_m, place.moved)
+            return moment.sectors
+        return self.navigator.known(moment.sectors, moment.on_map, reach_m, moment.moved)
 
     def refuse(self, reason: str) -> Command:
         """Return the command to stand for a reason that lies outside, and count it as bad input."""
