@@ -7,9 +7,8 @@ were lost, from their checkpoints, and several processes may search together.
 """
 
 import contextlib
-import fcntl
 import importlib.util
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -146,7 +145,8 @@ class Search:
         )
         with never_silent(_SILENCE_S), Work(doing, left, "trial") as work:
             while (done := len(self._done())) < settings.trials:
-                with self._turn():
+                # One search of this folder chooses at a time: a trial is there before it is held.
+                with contextlib.closing(FolderLock(self.folder, _TURN, wait=True)):
                     self._take_up_what_was_lost()
                     trial = self._ask()
                     claim = self._claim(trial)
@@ -160,13 +160,6 @@ class Search:
                     raise KeyboardInterrupt
                 work.end_unit()
         self._conclude()
-
-    @contextlib.contextmanager
-    def _turn(self) -> Iterator[None]:
-        """Wait until no other search of this folder chooses: a trial is there before it is said whose it is."""
-        with (self.folder / _TURN).open("a") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
 
     def _claim(self, trial: "optuna.Trial") -> FolderLock:
         """Make the folder of a trial and hold it; what is not held is lost."""

@@ -117,18 +117,19 @@ class FolderLock:
     Args:
         folder: must exist.
         name: of the file in it.
+        wait: until whoever holds it lets go of it, instead of refusing.
 
     Raises:
         UserInputError: if another process holds it, or it cannot be opened.
     """
 
-    def __init__(self, folder: Path, name: str = "lock") -> None:
+    def __init__(self, folder: Path, name: str = "lock", *, wait: bool = False) -> None:
         try:
             self._file = (folder / name).open("a", encoding="utf-8")
         except OSError as error:
             raise UserInputError(f"{folder / name} cannot be opened ({error.strerror}): remove it") from error
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             self._file.close()
             if isinstance(error, BlockingIOError):

@@ -134,7 +134,8 @@ class Navigator:
         self.reset()
         # Now, not before the first thing in the way: where nothing is kept of it yet, compiling takes seconds, and a
         # base may drive on meanwhile.
-        plan_detour(self._map.clearances, (0.0, 0.0), (1.0, 0.0), robot.circumradius_m)
+        if settings.replan:
+            plan_detour(self._map.clearances, (0.0, 0.0), (1.0, 0.0), robot.circumradius_m)
 
     def reset(self) -> None:
         """Forget everything: the robot was put somewhere else, or has a new task."""

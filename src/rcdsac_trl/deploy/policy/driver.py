@@ -248,7 +248,8 @@ class Driver:
             return self.policy.refuse("there is no odometry yet")
         if self._no_path or self._follower is None:
             return self.policy.refuse(self._no_path)
-        here, pose_s, moved_s = self._located(now_s)
+        velocity = messages.velocity_of_odometry(self._odometry)
+        here, pose_s, moved_s = self._located(now_s, velocity)
         waypoints = self._follower.update(here)
         if waypoints is None:
             return self.policy.refuse("the goal is reached")
@@ -256,7 +257,6 @@ class Driver:
             return self.policy.refuse(lacks)
         ranges, scanned_s = self._ranges(pose_s)
         stamps = Stamps(now_s, scanned_s, pose_s, moved_s)
-        velocity = messages.velocity_of_odometry(self._odometry)
         self.situation = Situation(here, waypoints, ranges, velocity)
         on_map = here
         if self._map_frame not in ("", self._path_frame):
@@ -273,11 +273,11 @@ class Driver:
             "its planner is late; plan again, or give a larger plan_timeout_s"
         )
 
-    def _located(self, now_s: float) -> tuple[tuple[float, float, float], float, float]:
+    def _located(self, now_s: float, velocity: tuple[float, float]) -> tuple[tuple[float, float, float], float, float]:
         """Return the robot's pose in the path's frame, the stamp of that pose, and the stamp of the odometry."""
         pose, moved_s = messages.pose_of_odometry(self._odometry), messages.stamp_s(self._odometry)
         # Only odometry: what a localisation corrects is no motion.
-        self._poses.check(pose[:2], moved_s, messages.velocity_of_odometry(self._odometry))
+        self._poses.check(pose[:2], moved_s, velocity)
         base_frame = str(getattr(self._odometry, "child_frame_id", ""))
         self._frames.moved(str(self._odometry.header.frame_id), base_frame, moved_s, pose)
         here, pose_s = self._frames.robot_in(self._path_frame, now_s)

@@ -10,7 +10,6 @@ _FASTEST_M_PER_S = 2.0
 # A pose that moves farther within this time, while the velocities are 0, is of a driver that leaves them empty.
 _MOVED_M, _MOVED_S = 0.15, 2.0
 
-
 Place = tuple[float, float]
 """x and y, m."""
 
