@@ -147,6 +147,7 @@ def test_preset_paper_is_the_root() -> None:
 def test_every_value_of_a_preset_takes_effect(preset: str) -> None:
     """The defaults list must name `_self_` first, else the root overrides its presets in silence."""
     values = yaml_of(f"preset/{preset}.yaml")
+    values.pop("defaults", None)
     cfg = compose("train", ["+algo=rcdsac_pow", f"preset={preset}"])
     for key, value in leaves(values):
         assert OmegaConf.select(cfg, key) == value, key
@@ -155,6 +156,12 @@ def test_every_value_of_a_preset_takes_effect(preset: str) -> None:
 def test_laptop_is_the_default_preset_and_changes_something() -> None:
     assert composed("+algo=rcdsac_pow") == composed("+algo=rcdsac_pow", "preset=laptop")
     assert composed("+algo=rcdsac_pow").learner != composed("+algo=rcdsac_pow", "preset=paper").learner
+
+
+def test_a_long_training_is_the_laptops_but_for_its_length() -> None:
+    long, laptop = composed("+algo=rcdsac_cvar", "preset=long"), composed("+algo=rcdsac_cvar", "preset=laptop")
+    assert (long.schedule.iterations, long.schedule.decay_iterations) == (400, 275)
+    assert replace(long, schedule=laptop.schedule) == laptop
 
 
 def test_the_command_line_wins_over_the_preset() -> None:

@@ -462,6 +462,14 @@ def test_a_plan_ages_where_the_command_line_says_so(folder: Path) -> None:
             assert reason is None if told is None else told in str(reason)
 
 
+def test_it_stands_until_it_is_released_where_the_command_line_says_so(folder: Path) -> None:
+    bridge, robot = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), "--stopped"])), Robot()
+    robot.say(scan=laser(10.0), odom=odometry(10.0), plan=plan(10.0))
+    assert "stop() was called" in str(bridge.step(10.0).reason)
+    robot.say(stop=ros.Bool(False))
+    assert bridge.step(10.0).reason is None
+
+
 def test_zeros_are_open_space_where_the_command_line_says_so(folder: Path) -> None:
     for arguments, reads_zero in (([], True), (["--zero-means", "far"], False)):
         bridge = dds_node.bridge_of(dds_node._parser().parse_args([str(folder), *arguments]))

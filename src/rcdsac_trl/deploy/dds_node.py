@@ -77,6 +77,8 @@ def bridge_of(args: argparse.Namespace) -> "DdsBridge":
     )
     driver.policy.check_beta(args.beta)
     driver.beta = args.beta
+    if args.stopped:
+        driver.policy.stop()
     clouds = [topic for _, topic, _ in args.camera]
     return DdsBridge(driver, domain_id, remapped=remapped, clouds=clouds, simulated=args.use_sim_time)
 
@@ -155,6 +157,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("agent", help="an exported folder, a run folder, or an agent that comes with the package")
     parser.add_argument("--beta", type=float, help="how much risk to take until the topic says otherwise")
+    parser.add_argument("--stopped", action="store_true", help="stand until the topic stop says false")
     parser.add_argument(
         "--laser",
         type=float,
