@@ -17,7 +17,6 @@ from rcdsac_trl.config.evaluation_settings import EvaluationSettings
 from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.rollout.make_agent import make_actor
 from rcdsac_trl.rollout.make_collector import make_episodes
-from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.world.task.world_settings import WorldSettings
 from tiny import evaluate, tiny_settings, tiny_trainer
 
@@ -89,7 +88,7 @@ def test_no_key_that_nothing_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     # What would start processes on other machines is told all that is chosen of them.
     monkeypatch.setattr("rcdsac_trl.rollout.ray_workers.RayWorkers", lambda *_, **__: None)
     settings = tiny_settings("sac", "collector=ray", "collector.num_processes=2", "collector.address=auto")
-    make_episodes(settings, make_actor(settings), "cpu", Progress())
+    make_episodes(settings, make_actor(settings), "cpu")
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-1]")
     turned = "beta_controller=[clearance,tail_variance]"
     evaluate(f"run={tmp_path / 'rcdsac_pow'}", "beta=[-2,-1]", turned, "record=true", "out=turned")

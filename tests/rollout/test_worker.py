@@ -25,7 +25,6 @@ from rcdsac_trl.rollout.make_collector import make_episodes
 from rcdsac_trl.rollout.policies import AgentNoise, PursuitPolicy
 from rcdsac_trl.rollout.worker import EpisodeBatch, RolloutWorker, side_by_side
 from rcdsac_trl.rollout.worker_processes import Drive, RolloutRequest, WorkerProcesses
-from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system import liveness
 from rcdsac_trl.system.processes import WorkerError
 from rcdsac_trl.training.make_learner import make_replay
@@ -115,7 +114,7 @@ def collected(row: str, *overrides: str) -> list[TensorDictBase]:
         given.append("collector=multi")
     settings = tiny_settings(row, *given)
     actor = make_loss(settings, "cpu").actor_network
-    episodes = make_episodes(settings, actor, "cpu", Progress())
+    episodes = make_episodes(settings, actor, "cpu")
     batches = []
     for iteration in range(2):
         batches.append(episodes.collect(iteration, iteration).clone())
@@ -147,7 +146,7 @@ def test_a_worker_whose_policy_cannot_be_made_is_closed(monkeypatch: pytest.Monk
     settings = tiny_settings("sac", "collector.num_processes=0")
     actor = make_loss(settings, "cpu").actor_network
     with pytest.raises(ZeroDivisionError):
-        make_episodes(settings, actor, "cpu", Progress())
+        make_episodes(settings, actor, "cpu")
     assert len(closed) == 1
 
 

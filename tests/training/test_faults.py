@@ -112,13 +112,22 @@ def test_a_run_goes_on_after_a_collecting_process_was_killed(tmp_path: Path, mon
     assert not multiprocessing.active_children()
 
 
-@pytest.mark.parametrize("processes", [0, 2])
+@pytest.mark.parametrize(
+    "collected",
+    [
+        ["collector.num_processes=0"],
+        ["collector.num_processes=2"],
+        ["collector=single"],
+        ["collector=parallel_env", "world.num_workers=2"],
+    ],
+    ids=lambda collected: collected[0],
+)
 def test_wrong_input_that_shows_as_agents_drive_ends_a_run_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, processes: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collected: list[str]
 ) -> None:
     monkeypatch.setattr("rcdsac_trl.system.process_pool.START_METHOD", "fork")  # starts at once
     run = tmp_path / "run"
-    trainer = tiny_trainer(run, "sac", f"collector.num_processes={processes}", "task.min_path_m=200")
+    trainer = tiny_trainer(run, "sac", *collected, "task.min_path_m=200")
     told = (
         "no goal lies 200 m of path away; lower min_path_m or choose a larger map: training stops in iteration 1; "
         f"0 iterations are saved, continue: {program()} train resume={run}"

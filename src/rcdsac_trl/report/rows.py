@@ -13,6 +13,7 @@ import pandas as pd
 # Name and measure of rows that the paper's table lacks.
 _BEYOND_THE_PAPER = {
     "rcdsac_pow_wide": ("RC-DSAC (resample)", "wide pow"),
+    "rcdsac_cvar_long": ("RC-DSAC (resample)", "long CVaR"),
     "mppi": ("MPPI", ""),
     "dwa": ("DWA", ""),
     "pursuit": ("pure pursuit", ""),

@@ -25,6 +25,7 @@ class EpisodeCollector(Protocol):
 
         Raises:
             WorkerError: if a worker process died or hung; what was driven on this map is lost.
+            UserInputError: if the input of a worker is wrong.
         """
 
     def close(self) -> None:
@@ -68,9 +69,8 @@ class TorchRLEpisodeCollector:
         make: makes a collector from an iteration and the number of its map; it yields ``[..., T]``, the episodes of
             that iteration, then of the next one on the next map, to the end of the schedule.
         set_iteration: told the iteration whose episodes are about to be collected.
-        iteration: the first one.
-        map_index: the number of its map.
         workers: the processes of its environment.
+        begin: begins the episodes on a map in this process, for a worker that dies of wrong input says nothing of it.
     """
 
     def __init__(
@@ -78,16 +78,15 @@ class TorchRLEpisodeCollector:
         make: Callable[[int, int], Collector],
         set_iteration: Callable[[int], None],
         *,
-        iteration: int,
-        map_index: int,
         workers: EnvWorkers,
+        begin: Callable[[int], object],
     ) -> None:
         self._make = make
         self._set_iteration = set_iteration
         self._workers = workers
+        self._begin = begin
         self._collector: Collector | None = None
         self._batches: Iterator[TensorDictBase] = iter(())
-        self._start(iteration, map_index)
 
     def collect(self, iteration: int, map_index: int) -> TensorDictBase:
         """See :class:`EpisodeCollector`."""
@@ -105,6 +104,7 @@ class TorchRLEpisodeCollector:
                 raise
             self._workers.kill()
             self.close()
+            self._begin(map_index)
             raise fault from error
         return batch.reshape(-1, batch.shape[-1])
 

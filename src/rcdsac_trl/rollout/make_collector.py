@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,6 +10,7 @@ import safetensors.torch
 import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from rcdsac_trl.config.training_settings import TrainingSettings
@@ -27,31 +29,26 @@ from rcdsac_trl.rollout.worker_processes import (
     WorkerGroup,
     WorkerProcesses,
 )
-from rcdsac_trl.storage.checkpoint_record import Progress
 from rcdsac_trl.system.cores import usable_cores
 from rcdsac_trl.system.processes import largest_divisor, resolve_num_workers, resolve_processes
 from rcdsac_trl.world.maps.generator import Split
+from rcdsac_trl.world.task.world_settings import WorldSettings
 
 SPLIT: Split = "train"
 
 
-def make_episodes(
-    settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress
-) -> EpisodeCollector:
+def make_episodes(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> EpisodeCollector:
     """Make what collects the episodes of each iteration.
 
     Args:
         settings: of the training.
         actor: drives, with the weights that it has when an iteration begins.
         device: where the actor is.
-        progress: what is done already.
     """
-    return _COLLECTORS[settings.collector.name](settings, actor, device, progress)
+    return _COLLECTORS[settings.collector.name](settings, actor, device)
 
 
-def _multi(
-    settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress
-) -> EpisodeCollector:
+def _multi(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> EpisodeCollector:
     """Share the agents out over processes; they drive on the CPU, wherever the learner is."""
     given = settings.world
     processes = resolve_processes(settings.collector.num_processes, given.num_agents, "collector.num_processes")
@@ -65,7 +62,7 @@ def _multi(
     return WorkerEpisodeCollector(group, lambda: packed(actor))
 
 
-def _ray(settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress) -> EpisodeCollector:
+def _ray(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> EpisodeCollector:
     """Share the agents out over processes of a Ray cluster; they drive on the CPU, wherever the learner is."""
     from rcdsac_trl.rollout.ray_workers import RayWorkers  # imports Ray, which takes long and may not be there
 
@@ -120,18 +117,16 @@ def _worker(settings: TrainingSettings, agent_ids: Sequence[int]) -> Iterator[Dr
         yield drive
 
 
-def _by_torchrl(
-    settings: TrainingSettings, actor: TensorDictSequential, device: str, progress: Progress
-) -> EpisodeCollector:
+def _by_torchrl(settings: TrainingSettings, actor: TensorDictSequential, device: str) -> EpisodeCollector:
     """Let TorchRL's own collector drive in this process, over the workers of a ``ParallelEnv`` where there are any."""
     world, schedule = settings.training_world, settings.schedule
     agent_ids = range(world.num_agents)
     policy = _collection_policy(settings, partial(make_policy, actor, device=device), agent_ids)
     iteration_steps = world.num_agents * world.task.episode_steps
 
-    def collector(iteration: int, map_index: int) -> Collector:
-        env = environment(
-            world,
+    def env(map_index: int, of: WorldSettings) -> EnvBase:
+        return environment(
+            of,
             settings.algo,
             split=SPLIT,
             seed=settings.seed,
@@ -139,8 +134,14 @@ def _by_torchrl(
             state_size=settings.network.state_size,
             first_episode=map_index,  # episode k of every agent is on map k
         )
+
+    def begin(map_index: int) -> None:
+        with contextlib.closing(env(map_index, replace(world, num_workers=0))) as begun:
+            begun.reset()
+
+    def collector(iteration: int, map_index: int) -> Collector:
         return Collector(
-            env,
+            env(map_index, world),
             policy,
             frames_per_batch=iteration_steps,
             total_frames=(schedule.iterations - iteration) * iteration_steps,
@@ -149,15 +150,13 @@ def _by_torchrl(
             use_buffers=False,
         )
 
-    done = progress.iterations
     workers = resolve_num_workers(world.num_workers, world.num_agents)
     described = list(_shares(settings, workers)) if workers else []
     return TorchRLEpisodeCollector(
         collector,
         policy.set_iteration,
-        iteration=done,
-        map_index=done + progress.skipped_maps,
         workers=EnvWorkers(described, world.worker_timeout_s),
+        begin=begin,
     )
 
 

@@ -177,7 +177,7 @@ def _assemble(
     return Trainer(
         schedule=settings.schedule,
         progress=progress,
-        episodes=make_episodes(settings, learner.loss.actor_network, device, progress),
+        episodes=make_episodes(settings, learner.loss.actor_network, device),
         learner=learner,
         guard=FiniteGuard(folder, learner.loss, learner.optimizer),
         validation=Validation(
