@@ -25,7 +25,7 @@ REFERENCE = "sac"
 # At which CVaR's agents for one beta were trained.
 _BETAS_OF_DSAC = (0.25, 0.75)
 # Rows that the paper's table lacks, left out of the differences.
-BESIDE = ("rcdsac_pow_wide", "pursuit")
+BESIDE = ("rcdsac_pow_wide", "rcdsac_cvar_long", "pursuit")
 # Agents first, then what they are compared with; others behind them.
 ORDER = ("rcdsac_pow", "rcdsac_cvar", "dsac", "rcwr", "sac", "pursuit")
 
@@ -51,12 +51,17 @@ def beta_trainings() -> Figure:
 
 
 def _draw_trainings(axes: Axes, metric: str, sensor: str) -> None:
-    """Draw a line for each training and one for their mean, and level lines of who has no beta."""
+    """Draw a line for each training, one for their mean and one for a long one, and level lines of who has no beta."""
     trained = [_means(run, metric).dropna() for run in all_trainings(RESULTS, f"rcdsac_cvar-{sensor}")]
     by_training = pd.concat(trained, axis=1, join="inner")
     axes.plot(by_training, color=LIGHT.robot, linewidth=1.0, alpha=0.45)
     mean = by_training.mean(axis=1)
     axes.plot(mean, color=LIGHT.robot, linewidth=2.4, marker="o", markersize=6)
+    long = RESULTS / f"rcdsac_cvar_long-{sensor}"
+    ends = {"RC-DSAC": mean}
+    if long.is_dir():
+        ends["RC-DSAC, long"] = _means(long, metric)[mean.index]
+        axes.plot(ends["RC-DSAC, long"], color=LIGHT.robot_edge, linewidth=1.8, marker="s", markersize=5)
     others = {"SAC": ("sac", LIGHT.alarm, "--"), "MPPI": ("mppi", LIGHT.ink, ":")}
     levels = {
         name: float(pd.concat([_means(run, metric) for run in all_trainings(RESULTS, f"{agent}-{sensor}")]).mean())
@@ -70,7 +75,7 @@ def _draw_trainings(axes: Axes, metric: str, sensor: str) -> None:
         axes.plot(beta, of_one.mean(), color=LIGHT.goal, marker="D", markersize=7)
     texts = {name: (level, others[name][1]) for name, level in levels.items()}
     if metric == "collisions":
-        texts["RC-DSAC"] = float(mean.iloc[-1]), LIGHT.robot
+        texts |= {name: (float(values.iloc[-1]), LIGHT.robot) for name, values in ends.items()}
         at = (_BETAS_OF_DSAC[-1], float(of_one.mean()))
         axes.annotate("DSAC", at, xytext=(8, -4), textcoords="offset points", fontsize=9, color=LIGHT.goal)
     _label_at_the_right(axes, texts)
