@@ -64,13 +64,12 @@ def collected(overrides: list[str], batches: int, *, wall: bool) -> float:
     from rcdsac_trl.config.compose import compose
     from rcdsac_trl.config.run_config import training_settings
     from rcdsac_trl.rollout.make_collector import make_episodes
-    from rcdsac_trl.storage.checkpoint_record import Progress
     from rcdsac_trl.training.make_learner import make_learner
 
     given = ["+algo=rcdsac_pow", "schedule.pursuit_iterations=0", *overrides]
     settings = training_settings(compose("train", given))
     learner = make_learner(settings, "cpu")
-    episodes = make_episodes(settings, learner.loss.actor_network, "cpu", Progress())
+    episodes = make_episodes(settings, learner.loss.actor_network, "cpu")
     iterations = iter(range(batches + 1))
 
     def collect() -> None:

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, SoftUpdate
 
 from rcdsac_trl.config.schedule import Schedule
@@ -227,9 +228,8 @@ def stub_trainer(folder: Path, events: list[Any], **changes: Any) -> Trainer:
         episodes=TorchRLEpisodeCollector(
             lambda iteration, map_index: Collector(events, iteration, map_index),  # type: ignore[arg-type,return-value]
             lambda iteration: events.append(("iteration", iteration)),
-            iteration=parts["progress"].iterations,
-            map_index=parts["progress"].iterations + parts["progress"].skipped_maps,
             workers=EnvWorkers([], None),
+            begin=lambda map_index: None,
         ),
         learner=StubLearner(events, parts["interrupt_in"], parts["progress"].iterations),
         guard=StubGuard(events, parts["fail_in"]),  # type: ignore[arg-type]
@@ -720,12 +720,18 @@ def test_workers_do_not_change_a_run(
     tiny_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
 ) -> None:
     """Workers in this process: the same code with the same shapes, without the time that processes take."""
-    monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", partial(make_env, serial=True))
+    driven: list[torch.Size] = []
+
+    def make(*args: Any, **given: Any) -> EnvBase:
+        env = make_env(*args, **given, serial=True)
+        driven.append(env.batch_size)
+        return env
+
+    monkeypatch.setattr("rcdsac_trl.rollout.environments.make_env", make)
     trainer = tiny_trainer(tmp_path / "run", "rcdsac_pow", "collector=parallel_env", f"world.num_workers={workers}")
     assert isinstance(trainer.episodes, TorchRLEpisodeCollector)
-    assert trainer.episodes._collector is not None
-    assert trainer.episodes._collector.env.batch_size == torch.Size([workers, AGENTS // workers])
     trainer.run()
+    assert torch.Size([workers, AGENTS // workers]) in driven
     assert_equal_runs(tiny_run, tmp_path / "run")
 
 
