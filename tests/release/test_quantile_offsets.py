@@ -2,6 +2,7 @@
 
 import json
 import math
+import runpy
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -185,6 +186,49 @@ def test_what_is_exported_of_a_run_has_its_offsets_too(run: Path, published: Pat
     assert export.weights.config.recalibration == read_weights(published).config.recalibration
     again = make_export(compose("export", [f"run={published}"]))
     assert again.weights.config.recalibration == read_weights(published).config.recalibration
+
+
+def test_an_agent_without_a_run_is_recalibrated(published: Path, tmp_path: Path) -> None:
+    shipped = read_weights(published).config.recalibration
+    given = ["as_driven=true", "num_maps=1", "num_workers=0", "threads=1", "every_steps=2", "seed=1"]
+    folder = calibrate(published, *given, "split=validation", "beta=[-2]", f"out={tmp_path / 'fit'}")
+    export = make_export(compose("export", [f"run={published}", f"calibration={folder}"]))
+    fitted = export.weights.config.recalibration
+    assert fitted == fit_recalibration(folder, "rcdsac_pow-narrow")
+    assert fitted is not None
+    assert fitted.betas == (-2.0,)
+    assert fitted != shipped
+    checked = calibrate(published, *given, "split=evaluation", "beta=[-2]", f"out={tmp_path / 'check'}")
+    with pytest.raises(UserInputError, match=r"check was driven on evaluation maps, which offsets are checked on"):
+        make_export(compose("export", [f"run={published}", f"calibration={checked}"]))
+    with pytest.raises(UserInputError, match=r"fit holds no calibration of rcdsac_pow-narrow as it drives now \("):
+        make_export(compose("export", [f"run={published}", f"calibration={folder}", "acting.num_candidates=3"]))
+    with pytest.raises(UserInputError, match=r"nothing holds no calibration: name a folder that calibrate wrote$"):
+        make_export(compose("export", [f"run={published}", f"calibration={tmp_path / 'nothing'}"]))
+
+
+def test_a_shipped_agent_whose_run_is_gone_is_recalibrated_with_its_card(published: Path, tmp_path: Path) -> None:
+    recalibrate = runpy.run_path(str(Path(__file__).resolve().parents[2] / "docs" / "recalibrate.py"))["recalibrate"]
+    folder = shutil.copytree(published, tmp_path / "weights" / "rcdsac_pow-narrow")
+    given = ["as_driven=true", "num_maps=1", "num_workers=0", "threads=1", "every_steps=2", "beta=[-2]"]
+    fit, check = (
+        calibrate(folder, *given, f"split={split}", f"out={tmp_path / split}") for split in ("validation", "evaluation")
+    )
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(UserInputError, match=r"was driven on evaluation maps"):
+        recalibrate(folder, check, fit)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    recalibrate(folder, fit, check)
+    after = read_weights(folder)
+    assert after.config.recalibration == fit_recalibration(fit, "rcdsac_pow-narrow")
+    assert after.measured is not None
+    told = after.measured.told_calibration
+    assert [(entry["beta"], entry["told"], entry["num_maps"]) for entry in told] == [
+        (-2.0, "raw", 1),
+        (-2.0, "recalibrated", 1),
+    ]
+    changed = {path.name for path in folder.iterdir() if path.read_bytes() != before[path.name]}
+    assert changed == {"config.json", "measured.json", "README.md"}
 
 
 def test_offsets_of_another_agent_are_not_taken(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

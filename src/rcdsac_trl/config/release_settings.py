@@ -15,6 +15,7 @@ class ExportSettings:
     run: str | None
     checkpoint: CheckpointName | None
     out: str | None
+    calibration: str | None
     num_quantiles: int
     acting: ActingOverride
 

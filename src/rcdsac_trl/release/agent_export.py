@@ -11,7 +11,7 @@ from rcdsac_trl.deploy.export.exported import LIMIT, betas_of, check_extra, diff
 from rcdsac_trl.deploy.policy.weights import Weights, packed
 from rcdsac_trl.errors import FaultError
 from rcdsac_trl.release.named_agent import RunAgent, named_agent
-from rcdsac_trl.release.quantile_offsets import with_offsets
+from rcdsac_trl.release.quantile_offsets import with_calibration, with_offsets
 from rcdsac_trl.storage import atomic
 from rcdsac_trl.system.progress import Work
 from rcdsac_trl.system.resources import check_empty
@@ -72,14 +72,17 @@ def make_export(cfg: DictConfig) -> Export:
     """Make an export of an agent; refuses before anything is written.
 
     Raises:
-        UserInputError: for a missing agent or package, or a folder that holds something.
+        UserInputError: for a missing agent or package, a calibration of another agent, or a folder that holds
+            something.
     """
     settings = read_config(cfg, ExportSettings)
     check_extra()
     assert settings.run is not None
     agent = named_agent(settings.run, settings.checkpoint)
     weights = settings.acting.in_weights(agent.weights())
-    if isinstance(agent, RunAgent):
+    if settings.calibration is not None:
+        weights = with_calibration(weights, agent.described["checkpoint"], Path(settings.calibration))
+    elif isinstance(agent, RunAgent):
         weights = with_offsets(weights, agent.folder, agent.checkpoint)
     out = agent.out / "export" / agent.stem if settings.out is None else Path(settings.out)
     check_empty(out)

@@ -119,21 +119,31 @@ def driven_calibration(run: Path, checkpoint: CheckpointName, weights: Weights, 
         weights: of the agent, in single precision.
         split: of the maps that were driven.
     """
-    digest = sha256(stored(halved(weights), half=True)).hexdigest()
     found = {}
     for path in sorted(run.glob("calibration/*/calibration.json")):
         described = _described(path.parent)
-        if not described.get("as_driven", False) or (described["checkpoint"], described["split"]) != (
-            checkpoint,
-            split,
-        ):
-            continue
-        driven = described.get("weights_sha256")
-        if driven not in (None, digest) or ActingSettings(**described["acting"]) != weights.config.acting:
+        if described["split"] != split or not _is_of(described, checkpoint, weights):
             continue
         number = described["num_maps"] * described["num_episodes"] * len(described["conditions"])
-        found[path.parent] = (driven == digest, number)
+        found[path.parent] = (_is_as_shipped(described, weights), number)
     return max(found, key=lambda folder: found[folder]) if found else None
+
+
+def _is_of(described: Mapping[str, Any], checkpoint: object, weights: Weights) -> bool:
+    """Tell whether a calibration is one as driven, of that checkpoint and these weights, which acted as they say.
+
+    One of a run's checkpoint as it was trained does not say which weights drove.
+    """
+    if not described.get("as_driven", False) or described["checkpoint"] != checkpoint:
+        return False
+    digest = described.get("weights_sha256")
+    files = (stored(weights), stored(halved(weights), half=True))
+    known = digest is None or digest in {sha256(file).hexdigest() for file in files}
+    return known and ActingSettings(**described["acting"]) == weights.config.acting
+
+
+def _is_as_shipped(described: Mapping[str, Any], weights: Weights) -> bool:
+    return bool(described.get("weights_sha256") == sha256(stored(halved(weights), half=True)).hexdigest())
 
 
 def with_offsets(weights: Weights, run: Path, checkpoint: CheckpointName) -> Weights:
@@ -145,10 +155,47 @@ def with_offsets(weights: Weights, run: Path, checkpoint: CheckpointName) -> Wei
         checkpoint: of the agent.
     """
     folder = driven_calibration(run, checkpoint, weights, "validation")
-    if folder is None:
-        return weights
-    agent = name_of(weights.config)
-    return replace(weights, config=replace(weights.config, recalibration=fit_recalibration(folder, agent)))
+    return weights if folder is None else _fitted(weights, folder)
+
+
+def with_calibration(weights: Weights, checkpoint: object, folder: Path) -> Weights:
+    """Return an agent with the offsets that a calibration asks for, wherever it lies; they replace those it has.
+
+    Args:
+        weights: of the agent.
+        checkpoint: of the training that they are of, as descriptions have it.
+        folder: that ``calibrate as_driven=true split=validation`` of this agent wrote.
+
+    Raises:
+        UserInputError: if it holds no such calibration.
+    """
+    check_driven(folder, weights, checkpoint)
+    return _fitted(weights, folder)
+
+
+def check_driven(folder: Path, weights: Weights, checkpoint: object) -> None:
+    """Refuse a folder that holds no calibration as driven of an agent.
+
+    Args:
+        folder: that may hold one.
+        weights: of the agent.
+        checkpoint: of the training that they are of, as descriptions have it.
+
+    Raises:
+        UserInputError: if it holds none, or one of another agent.
+    """
+    if not (folder / "calibration.json").is_file():
+        raise UserInputError(f"{folder} holds no calibration: name a folder that calibrate wrote")
+    if not _is_of(_described(folder), checkpoint, weights):
+        raise UserInputError(
+            f"{folder} holds no calibration of {name_of(weights.config)} as it drives now ({weights.config.acting}): "
+            "calibrate it with as_driven=true, the same checkpoint and acting"
+        )
+
+
+def _fitted(weights: Weights, folder: Path) -> Weights:
+    recalibration = fit_recalibration(folder, name_of(weights.config))
+    return replace(weights, config=replace(weights.config, recalibration=recalibration))
 
 
 def name_of(config: AgentConfig) -> str:

@@ -53,7 +53,7 @@ def measured_values(
         "train_seed": described["train_seed"],
         "commit": described["commit"],
         "calibration": [] if calibration is None else _calibration(calibration),
-        "told_calibration": [] if driven is None else _told_calibration(driven, tell),
+        "told_calibration": [] if driven is None else told_calibration(driven, tell),
     }
 
 
@@ -100,7 +100,16 @@ def _calibration(folder: Path) -> list[dict[str, Any]]:
     ]
 
 
-def _told_calibration(folder: Path, tell: Tell | None) -> list[dict[str, Any]]:
+def told_calibration(folder: Path, tell: Tell | None) -> list[dict[str, Any]]:
+    """Return how true the quantiles are that an agent tells: `told_calibration` of :func:`measured_values`.
+
+    Args:
+        folder: that ``calibrate as_driven=true`` wrote.
+        tell: how the agent recalibrates what its critics say; None: it does not.
+
+    Raises:
+        UserInputError: if it cannot be read.
+    """
     with _readable(folder):
         versions = driven_calibration_of(folder, tell)
         described = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
