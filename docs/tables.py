@@ -50,7 +50,7 @@ from rcdsac_trl.report.read import Episodes, read_episodes
 from rcdsac_trl.report.rows import condition_label, paper_table, row_label
 from rcdsac_trl.report.statistics import Interval, compare
 from rcdsac_trl.report.table import comparison
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import training_errors
 from rcdsac_trl.report.verdict_words import numbers, of_agents
 from rcdsac_trl.report.verdicts import Finding
 
@@ -185,7 +185,7 @@ def table_of_differences(episodes: Episodes, names: Sequence[str]) -> str:
         names: the sensor, agents, ``from``, and what they are compared with.
     """
     sensor, *agents = names[: names.index("from")]
-    errors, conditions = TrainingErrors(episodes), episodes.conditions[episodes.conditions["sensor"] == sensor]
+    errors, conditions = training_errors(episodes), episodes.conditions[episodes.conditions["sensor"] == sensor]
     against = [conditions[conditions["agent"] == name].iloc[0] for name in names[names.index("from") + 1 :]]
     rows = []
     for agent in agents:

@@ -12,7 +12,7 @@ from rcdsac_trl.report.read import Episodes, possible
 from rcdsac_trl.report.rows import called, paper_table
 from rcdsac_trl.report.statistics import Interval
 from rcdsac_trl.report.table import TABULATED
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import training_errors
 
 FIRST = "RC-DSAC (resample)"
 """What the others are compared with."""
@@ -63,7 +63,7 @@ def averages(episodes: Episodes) -> pd.DataFrame:
         planners; and for `collisions` and `reward` the mean, its `_low` and `_high`, and with `_from` behind the
         metric's name how much more :data:`FIRST` has, with its `_low` and `_high`, missing of itself.
     """
-    errors, conditions = TrainingErrors(episodes), episodes.conditions
+    errors, conditions = training_errors(episodes), episodes.conditions
     kinds = averaged_rows(conditions[conditions["beta_controller"].isna()])
     rows = []
     for (name, sensor), of_kind in kinds.items():

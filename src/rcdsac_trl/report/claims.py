@@ -15,7 +15,7 @@ from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.rows import condition_label, paper_table
 from rcdsac_trl.report.statistics import Array
 from rcdsac_trl.report.table import SENSORS
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import training_errors
 from rcdsac_trl.report.training_scatter import TrainingError
 from rcdsac_trl.report.verdicts import Cell, Claim, Expectation, Finding, Group, Measured, find, than
 
@@ -50,7 +50,7 @@ def _measured(episodes: Episodes) -> Measured:
     def printed(cell: Cell, metric: str) -> float:
         return float(paper[cell][f"{metric}_mean"]) if cell in paper else math.nan
 
-    errors = TrainingErrors(episodes)
+    errors = training_errors(episodes)
 
     def error(terms: Sequence[tuple[float, Cell]], metric: str) -> TrainingError | None:
         if not all(errors.is_known(cell.sensor, metric) for _, cell in terms):

@@ -17,7 +17,7 @@ from rcdsac_trl.report.panels import PANEL
 from rcdsac_trl.report.read import METRIC_NAMES, Episodes
 from rcdsac_trl.report.rows import called, setting_label
 from rcdsac_trl.report.style import FAINT, INK, PAPER, style
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import training_errors
 
 # What less of a metric is called, where it is counted.
 _LESS = {"collisions": "fewer", "goals": "fewer"}
@@ -50,7 +50,7 @@ def paired_differences(episodes: Episodes, reference: int, metric: str) -> Figur
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     rng = np.random.default_rng(0)
-    errors = TrainingErrors(episodes)
+    errors = training_errors(episodes)
     for row, i in enumerate(others):
         first, second = episodes.of(conditions.iloc[i], metric), episodes.of(base, metric)
         maps = np.nanmean(first, axis=(0, 2)) - np.nanmean(second, axis=(0, 2))

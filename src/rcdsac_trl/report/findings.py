@@ -9,7 +9,7 @@ from rcdsac_trl.report import statistics
 from rcdsac_trl.report.read import CONDITION, Episodes, possible
 from rcdsac_trl.report.rows import condition_label
 from rcdsac_trl.report.statistics import Array, Interval, Statistic
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import training_errors
 from rcdsac_trl.report.training_scatter import TrainingError
 
 TAILS = (0.1, 0.25)
@@ -47,7 +47,7 @@ def bounded(
 
 def summary(episodes: Episodes) -> pd.DataFrame:
     """Return `condition`, `statistic`, `value`, `low`, `high`: every metric's mean, and :data:`SUMMARISED`."""
-    rows, errors = [], TrainingErrors(episodes)
+    rows, errors = [], training_errors(episodes)
     for (_, condition), label in zip(episodes.conditions.iterrows(), labels(episodes), strict=True):
         wanted = {metric: (metric, statistics.mean) for metric in episodes.metrics} | SUMMARISED
         for name, (metric, statistic) in wanted.items():
@@ -65,7 +65,7 @@ def comparisons(episodes: Episodes) -> pd.DataFrame:
         probability that an episode of the first is the better one, `better_low`, `better_high`; and `p_value`,
         adjusted by Holm's method for the number of pairs of its sensor, a metric at a time.
     """
-    rows, errors = [], TrainingErrors(episodes)
+    rows, errors = [], training_errors(episodes)
     named = list(zip(episodes.conditions.iterrows(), labels(episodes), strict=True))
     for ((_, first), first_label), ((_, second), second_label) in itertools.combinations(named, 2):
         if first["sensor"] != second["sensor"]:
@@ -135,7 +135,7 @@ def adaptive(episodes: Episodes) -> pd.DataFrame:
         and `best_value`; `difference` from it, `low`, `high`; and `p_value`, adjusted by Holm's method for the agent's
         number of controllers.
     """
-    rows, errors = [], TrainingErrors(episodes)
+    rows, errors = [], training_errors(episodes)
     for (agent, sensor), conditions in episodes.conditions.groupby(["agent", "sensor"], sort=False):
         turned = conditions[conditions["beta_controller"].notna()]
         fixed = [condition for _, condition in conditions.dropna(subset="beta").iterrows()]

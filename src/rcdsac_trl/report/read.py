@@ -132,9 +132,9 @@ def under(rows: pd.DataFrame, condition: pd.Series, by: Sequence[str]) -> pd.Dat
     return rows
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Episodes:
-    """The episodes of several evaluations on the same maps.
+    """The episodes of several evaluations on the same maps. Each equals itself alone, so what follows can be kept.
 
     Attributes:
         table: one row an episode: :data:`CONDITION`, `mean_beta`, `train_seed`, `map`, `episode`, the metrics that

@@ -16,7 +16,7 @@ from rcdsac_trl.report.read import Episodes
 from rcdsac_trl.report.rows import condition_label, has_dial
 from rcdsac_trl.report.statistics import Interval, Statistic
 from rcdsac_trl.report.style import FAINT, INK, MARKERS, PAPER, series, style
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import TrainingErrors, training_errors
 
 _TAIL = TAILS[0]
 # What follows beta, in four panels.
@@ -56,7 +56,7 @@ def beta_response(episodes: Episodes, measure: str) -> Figure | None:
     if not (groups := _driven_at_several(episodes, measure)):
         return None
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
-    errors = TrainingErrors(episodes)
+    errors = training_errors(episodes)
     known = any(errors.is_known(rows.iloc[0]["sensor"], "reward") for _, rows in groups)
     figure.suptitle(
         f"What β does, {_MEASURES.get(measure, measure)}: averse at the left; "
@@ -108,7 +108,7 @@ def _driven_at_several(episodes: Episodes, measure: str) -> _Groups:
 
 def _draw_response(axes: Axes, episodes: Episodes, groups: _Groups, heading: str) -> None:
     metric, statistic = _RESPONSES[heading]
-    errors = TrainingErrors(episodes)
+    errors = training_errors(episodes)
     for number, ((name, rows), color) in enumerate(zip(groups, series(len(groups)), strict=True)):
         values = [episodes.of(condition, metric) for _, condition in rows.iterrows()]
         marker = MARKERS[number % len(MARKERS)]

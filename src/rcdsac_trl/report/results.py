@@ -12,7 +12,7 @@ from rcdsac_trl.report.claims import judged_claims
 from rcdsac_trl.report.course_claims import judged_course_claims
 from rcdsac_trl.report.course_table import course_table
 from rcdsac_trl.report.read import Episodes
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import training_errors
 from rcdsac_trl.report.verdicts import Finding
 
 
@@ -69,7 +69,7 @@ class Results:
     @cached_property
     def trainings(self) -> pd.DataFrame:
         """How far the trainings of each agent lie apart."""
-        return TrainingErrors(self.episodes).trainings(findings.COMPARED)
+        return training_errors(self.episodes).trainings(findings.COMPARED)
 
     @cached_property
     def trends(self) -> pd.DataFrame:

@@ -12,7 +12,7 @@ are compared.
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,8 +139,9 @@ def lower_mean(values: Array, share: float) -> Array:
     return ordered @ counted / counted.sum()
 
 
+@cache
 def cvar(share: float) -> Statistic:
-    """Return the statistic "mean of the worst share of all episodes" of a return: realised CVaR.
+    """Return the statistic "mean of the worst share of all episodes" of a return: realised CVaR. One a share.
 
     Example:
         >>> cvar(0.25)(np.arange(8.0))

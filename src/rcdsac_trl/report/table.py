@@ -9,7 +9,7 @@ from rcdsac_trl.report.formats import interval, number
 from rcdsac_trl.report.read import Episodes, possible
 from rcdsac_trl.report.rows import called, condition_label, paper_table
 from rcdsac_trl.report.statistics import CONFIDENCE_TEXT, bootstrap
-from rcdsac_trl.report.training_errors import TrainingErrors
+from rcdsac_trl.report.training_errors import training_errors
 
 SENSORS = ("narrow", "sparse")
 TABULATED = ("collisions", "reward")
@@ -23,7 +23,7 @@ def own_table(episodes: Episodes) -> pd.DataFrame:
     where it is known how these differ.
     """
     conditions = episodes.conditions
-    rows, errors = [], TrainingErrors(episodes)
+    rows, errors = [], training_errors(episodes)
     for _, condition in conditions[conditions["beta_controller"].isna()].iterrows():  # the paper turns no beta
         row = {key: condition[key] for key in [*KEY, "sensor"]}
         for metric in TABULATED:

@@ -4,6 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
@@ -36,6 +37,12 @@ class _Table:
     seeds: list[list[int]]
     values: list[Array]
     scatter: TrainingScatter
+
+
+@lru_cache(maxsize=1)
+def training_errors(episodes: Episodes) -> "TrainingErrors":
+    """Return the errors of a report's conditions: all its tables and figures ask for those of the same episodes."""
+    return TrainingErrors(episodes)
 
 
 class TrainingErrors:
