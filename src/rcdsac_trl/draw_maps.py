@@ -20,7 +20,8 @@ from rcdsac_trl.world.maps.files.barn import BarnMapSettings
 from rcdsac_trl.world.maps.files.file_map import FileMapSettings, described
 from rcdsac_trl.world.maps.files.map_files import map_files
 from rcdsac_trl.world.maps.generator import Split
-from rcdsac_trl.world.maps.map_source import MapSource, make_map
+from rcdsac_trl.world.maps.map_source import MapSource, check_maps, make_map
+from rcdsac_trl.world.task.rules import TaskSettings
 
 _MAX_COUNT = 100
 
@@ -63,6 +64,10 @@ class Sheet:
             maps = [make_map(source, self.split, self.seed, index) for index in range(self.count)]
             contact_sheet(maps, self.split, self.seed, drawn=work.end_unit).savefig(out, dpi=130)
         print(f"drew {counted(self.count, 'map')}: {out}")
+        try:
+            check_maps(source, TaskSettings().min_path_m)
+        except UserInputError as error:  # the picture shows why
+            print(f"train and evaluate refuse this for the paper's robot: {error}")
         if self.json is not None:
             folder = Path(self.json)
             folder.mkdir(parents=True, exist_ok=True)

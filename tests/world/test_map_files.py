@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from world_files import FREE, OCCUPIED, UNKNOWN, room, write_map_server, write_world
 
+from rcdsac_trl.config.compose import compose
 from rcdsac_trl.config.paths import CONF_DIR
+from rcdsac_trl.draw_maps import make_sheet
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.seeding import stream
 from rcdsac_trl.world.maps.files.barn import GOAL, START, BarnMapSettings, optimal_time_s
@@ -475,6 +477,16 @@ def test_a_first_goal_does_not_make_a_floor_large_enough_for_the_next(tmp_path: 
     with pytest.raises(UserInputError, match=r"and task\.min_path_m=4"):
         check_file_maps(settings, 4.0)
     check_file_maps(settings, 0.0)  # BARN's goals are given
+
+
+def test_a_picture_says_what_a_drive_will_refuse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for cells in (120, 40):
+        path = write_map_server(tmp_path / f"{cells}.yaml", room(cells, cells))
+        out = tmp_path / f"{cells}.png"
+        make_sheet(compose("draw_maps", ["map=file", f"map.path={path}", "count=1", f"out={out}"])).run()
+        assert out.is_file()
+        said = capsys.readouterr().out
+        assert ("train and evaluate refuse this for the paper's robot: " in said) == (cells == 40)
 
 
 @pytest.mark.parametrize(
