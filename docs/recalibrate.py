@@ -14,7 +14,7 @@ from pathlib import Path
 
 from rcdsac_trl.deploy.policy.weights import packed
 from rcdsac_trl.release.named_agent import named_agent
-from rcdsac_trl.release.quantile_offsets import check_driven, with_calibration
+from rcdsac_trl.release.quantile_offsets import check_checked, with_calibration
 from rcdsac_trl.report.card import told_calibration
 from rcdsac_trl.storage import atomic
 
@@ -25,12 +25,12 @@ def recalibrate(folder: Path, fit: Path, check: Path) -> None:
     """Write the agent of a weights folder anew, with what one calibration asks for and another one finds.
 
     Raises:
-        UserInputError: if one is of another agent, or the first not of validation maps; nothing is written then.
+        UserInputError: if one is of another agent or of the other's maps; nothing is written then.
     """
     agent = named_agent(folder)
     checkpoint = agent.described["checkpoint"]
     weights = with_calibration(agent.weights(), checkpoint, fit)
-    check_driven(check, weights, checkpoint)
+    check_checked(check, weights, checkpoint)
     assert weights.config.recalibration is not None
     assert weights.measured is not None
     told = told_calibration(check, weights.config.recalibration.tell)

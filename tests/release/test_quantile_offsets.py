@@ -217,6 +217,8 @@ def test_a_shipped_agent_whose_run_is_gone_is_recalibrated_with_its_card(publish
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(UserInputError, match=r"was driven on evaluation maps"):
         recalibrate(folder, check, fit)
+    with pytest.raises(UserInputError, match=r"was driven on validation maps, .* split=evaluation to check them$"):
+        recalibrate(folder, fit, fit)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     recalibrate(folder, fit, check)
     after = read_weights(folder)

@@ -26,7 +26,7 @@ from rcdsac_trl.config.training_settings import TrainingSettings
 from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.deploy.policy.registry import is_shipped
-from rcdsac_trl.deploy.policy.weights import WEIGHTS_NAME, Weights, halved, read_weights, stored
+from rcdsac_trl.deploy.policy.weights import WEIGHTS_NAME, Weights, digest_of, halved, read_weights
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.run_weights import TEMPERATURE, agent_config, states_of_weights, weights_of_run
 from rcdsac_trl.rollout.make_agent import make_average, make_loss
@@ -126,9 +126,7 @@ class RunAgent(NamedAgent):
     @property
     def described(self) -> dict[str, Any]:
         """Its checkpoint; and the digest of the weights that would ship, where these are taken."""
-        shipped = (
-            {"weights_sha256": sha256(stored(self._shipped, half=True)).hexdigest()} if self.half_precision else {}
-        )
+        shipped = {"weights_sha256": digest_of(self._shipped, half=True)} if self.half_precision else {}
         return {"checkpoint": self.checkpoint} | shipped
 
     @property

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from rcdsac_trl.deploy.policy.acting import ActingSettings
 from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.measured import Measured, measured_of
 from rcdsac_trl.deploy.policy.model_card import limits_of
-from rcdsac_trl.deploy.policy.weights import Weights, halved, packed, stored
+from rcdsac_trl.deploy.policy.weights import Weights, digest_of, halved, packed
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.release.named_agent import RunAgent, named_agent
 from rcdsac_trl.release.quantile_offsets import driven_calibration, name_of, with_offsets
@@ -82,7 +81,7 @@ class Published:
         return measured_of(
             values
             | {
-                "weights_sha256": _digest(self.small),
+                "weights_sha256": digest_of(self.small, half=True),
                 "as_shipped": self.as_shipped,
                 "command": f"python -m rcdsac_trl.verify {name} {again}",
                 "precision": precision,
@@ -173,7 +172,7 @@ def make_publication(cfg: DictConfig) -> Publication:
         if name in agents:
             raise UserInputError(f"{agents[name].run} and {run} are both {name}: publish one of them")
         small = halved(weights)
-        evaluation, as_shipped = _evaluation_of(run, settings.checkpoint, _digest(small), config.acting)
+        evaluation, as_shipped = _evaluation_of(run, settings.checkpoint, digest_of(small, half=True), config.acting)
         calibration = _calibration_of(run, settings.checkpoint)
         driven = driven_calibration(run, settings.checkpoint, weights, "evaluation")
         agents[name] = Published(run, weights, small, agent.training, evaluation, as_shipped, calibration, driven)
@@ -183,11 +182,6 @@ def make_publication(cfg: DictConfig) -> Publication:
             if (folder / name).exists():
                 raise UserInputError(f"{folder / name} exists: remove it, or publish into another folder")
     return Publication(agents, Path(settings.weights), Path(settings.results))
-
-
-def _digest(small: Weights) -> str:
-    """Return the SHA-256 of the file that weights in half precision are stored in."""
-    return sha256(stored(small, half=True)).hexdigest()
 
 
 def _evaluation_of(run: Path, checkpoint: CheckpointName, digest: str, acting: ActingSettings) -> tuple[Path, bool]:

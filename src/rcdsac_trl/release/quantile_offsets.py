@@ -7,7 +7,6 @@ are checked on: offsets are never fitted on the maps that they are judged by.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from rcdsac_trl.deploy.policy.agent_config import AgentConfig
 from rcdsac_trl.deploy.policy.distortion import fractions_of
 from rcdsac_trl.deploy.policy.recalibration import Recalibration
 from rcdsac_trl.deploy.policy.registry import agent_name
-from rcdsac_trl.deploy.policy.weights import Weights, halved, stored
+from rcdsac_trl.deploy.policy.weights import Weights, digest_of, halved
 from rcdsac_trl.errors import UserInputError
 from rcdsac_trl.robot.robot_settings import PAPER
 
@@ -119,31 +118,32 @@ def driven_calibration(run: Path, checkpoint: CheckpointName, weights: Weights, 
         weights: of the agent, in single precision.
         split: of the maps that were driven.
     """
+    shipped, digests = _digests(weights)
     found = {}
     for path in sorted(run.glob("calibration/*/calibration.json")):
         described = _described(path.parent)
-        if described["split"] != split or not _is_of(described, checkpoint, weights):
+        if described["split"] != split or not _is_of(described, checkpoint, weights, digests):
             continue
         number = described["num_maps"] * described["num_episodes"] * len(described["conditions"])
-        found[path.parent] = (_is_as_shipped(described, weights), number)
+        found[path.parent] = (described.get("weights_sha256") == shipped, number)
     return max(found, key=lambda folder: found[folder]) if found else None
 
 
-def _is_of(described: Mapping[str, Any], checkpoint: object, weights: Weights) -> bool:
-    """Tell whether a calibration is one as driven, of that checkpoint and these weights, which acted as they say.
+def _digests(weights: Weights) -> tuple[str, frozenset[str | None]]:
+    """Return the digest of the weights as they ship, and all that a calibration of them may name.
 
-    One of a run's checkpoint as it was trained does not say which weights drove.
+    One of a run's checkpoint as it was trained does not say which weights drove: None.
     """
+    shipped = digest_of(halved(weights), half=True)
+    return shipped, frozenset({shipped, digest_of(weights), None})
+
+
+def _is_of(described: Mapping[str, Any], checkpoint: object, weights: Weights, digests: frozenset[str | None]) -> bool:
+    """Tell whether a calibration is one as driven, of that checkpoint and these weights, which acted as they say."""
     if not described.get("as_driven", False) or described["checkpoint"] != checkpoint:
         return False
-    digest = described.get("weights_sha256")
-    files = (stored(weights), stored(halved(weights), half=True))
-    known = digest is None or digest in {sha256(file).hexdigest() for file in files}
+    known = described.get("weights_sha256") in digests
     return known and ActingSettings(**described["acting"]) == weights.config.acting
-
-
-def _is_as_shipped(described: Mapping[str, Any], weights: Weights) -> bool:
-    return bool(described.get("weights_sha256") == sha256(stored(halved(weights), half=True)).hexdigest())
 
 
 def with_offsets(weights: Weights, run: Path, checkpoint: CheckpointName) -> Weights:
@@ -169,24 +169,34 @@ def with_calibration(weights: Weights, checkpoint: object, folder: Path) -> Weig
     Raises:
         UserInputError: if it holds no such calibration.
     """
-    check_driven(folder, weights, checkpoint)
+    _check_driven(folder, weights, checkpoint)
     return _fitted(weights, folder)
 
 
-def check_driven(folder: Path, weights: Weights, checkpoint: object) -> None:
-    """Refuse a folder that holds no calibration as driven of an agent.
+def check_checked(folder: Path, weights: Weights, checkpoint: object) -> None:
+    """Refuse a folder on which an agent's offsets cannot be checked.
 
     Args:
-        folder: that may hold one.
+        folder: that ``calibrate as_driven=true split=evaluation`` of this agent wrote.
         weights: of the agent.
         checkpoint: of the training that they are of, as descriptions have it.
 
     Raises:
-        UserInputError: if it holds none, or one of another agent.
+        UserInputError: if it holds no such calibration.
     """
+    _check_driven(folder, weights, checkpoint)
+    if (split := _described(folder)["split"]) != "evaluation":
+        raise UserInputError(
+            f"{folder} was driven on {split} maps, which offsets are fitted on: calibrate with split=evaluation to "
+            "check them"
+        )
+
+
+def _check_driven(folder: Path, weights: Weights, checkpoint: object) -> None:
+    """Refuse a folder that holds no calibration as driven of an agent."""
     if not (folder / "calibration.json").is_file():
         raise UserInputError(f"{folder} holds no calibration: name a folder that calibrate wrote")
-    if not _is_of(_described(folder), checkpoint, weights):
+    if not _is_of(_described(folder), checkpoint, weights, _digests(weights)[1]):
         raise UserInputError(
             f"{folder} holds no calibration of {name_of(weights.config)} as it drives now ({weights.config.acting}): "
             "calibrate it with as_driven=true, the same checkpoint and acting"

@@ -195,6 +195,11 @@ def stored(weights: Weights, *, half: bool = False) -> bytes:
     return save_tensors({name: np.ascontiguousarray(value, dtype) for name, value in weights.tensors.items()})
 
 
+def digest_of(weights: Weights, *, half: bool = False) -> str:
+    """Return the SHA-256 of the file that :func:`stored` makes of an agent's weights."""
+    return sha256(stored(weights, half=half)).hexdigest()
+
+
 def card_of(weights: Weights, measured: Measured | None) -> str:
     """Return the card of an agent, Markdown, with what is known of how it drives."""
     return model_card(weights.config, sum(tensor.size for tensor in weights.tensors.values()), measured)
